@@ -1,0 +1,253 @@
+"""Cards: TOML files in ``tasks/``, one a task, and how a card, a variant and ``--set`` combine.
+
+Order, later wins: method defaults < card < variant < ``--set``.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from solar_cli.errors import UsageError, nearest
+from solar_cli.settings.registry import method, method_names, settings_class
+from solar_cli.settings.schema import Settings, setting
+from solar_cli.settings.task import EvaluationSettings, TaskSettings
+
+PACKAGED = Path(__file__).parent.parent / "_tasks"
+CHECKOUT = Path(__file__).parent.parent.parent / "tasks"
+NAME = re.compile(r"[a-z0-9][a-z0-9_.-]*\Z")
+Table = dict[str, Any]
+S = TypeVar("S", bound=BaseModel)
+
+
+class CardTables(Settings):
+    """The top level of a card."""
+
+    summary: str = setting(..., "one sentence: what must be done")
+    task: TaskSettings = setting(..., "the control problem")
+    evaluation: EvaluationSettings = setting(EvaluationSettings(), "how a policy is judged")
+    methods: dict[str, Table] = setting({}, "what each method changes for this task")
+    variants: dict[str, Table] = setting({}, "named overrides of this card")
+
+
+@dataclass(frozen=True)
+class Card:
+    """One task as its file describes it."""
+
+    name: str
+    path: Path
+    tables: Table
+    """the file's content, before defaults"""
+
+    @property
+    def summary(self) -> str:
+        """One sentence: what must be done."""
+        return str(self.tables["summary"])
+
+    @property
+    def task(self) -> TaskSettings:
+        """The task as the card's ``default`` variant has it."""
+        return TaskSettings.model_validate(self.tables["task"])
+
+    @property
+    def evaluation(self) -> EvaluationSettings:
+        """How the report reads this task."""
+        return EvaluationSettings.model_validate(self.tables.get("evaluation", {}))
+
+    @property
+    def variants(self) -> list[str]:
+        """``default`` and the variants that the card names."""
+        return ["default", *sorted(self.tables.get("variants", {}))]
+
+
+class Configuration(Settings):
+    """Everything that one cell is told, resolved."""
+
+    task: TaskSettings = setting(..., "the control problem")
+    evaluation: EvaluationSettings = setting(..., "how a policy is judged")
+    method: Settings = setting(..., "the method's settings")
+
+
+@dataclass(frozen=True)
+class Resolved:
+    """A configuration and where each of its values comes from."""
+
+    configuration: Configuration
+    origins: dict[str, str]
+    """dotted path -> ``card``, ``variant NAME`` or ``--set``; all others are defaults"""
+
+
+def card_folders() -> list[Path]:
+    """Where cards are looked for by name: ``./tasks`` first, then the package's own."""
+    return [Path("tasks"), CHECKOUT if CHECKOUT.is_dir() else PACKAGED]
+
+
+def card_names() -> list[str]:
+    """Names of all cards that can be found."""
+    return sorted({path.stem for folder in card_folders() for path in folder.glob("*.toml")})
+
+
+def load_card(name: str) -> Card:
+    """Read the card at path ``name`` (ending in .toml) or of that name.
+
+    Raises `UsageError` naming file, line or key, and what was expected.
+    """
+    if name.endswith(".toml"):
+        return _read(Path(name))
+    for folder in card_folders():
+        if (path := folder / f"{name}.toml").is_file():
+            return _read(path)
+    raise UsageError(f"unknown task {name!r}: {nearest(name, card_names())}")
+
+
+def _read(path: Path) -> Card:
+    if not NAME.match(path.stem):
+        raise UsageError(
+            f"card {path}: a task's name has lower-case letters, digits, '-', '_' and '.' only; "
+            "rename the file"
+        )
+    try:
+        tables = tomllib.loads(path.read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise UsageError(f"card {path}: not valid TOML: {error}; correct that line") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"card {path}: cannot be read ({error}); name a readable file") from error
+    card = Card(path.stem, path, tables)
+    _validated(CardTables, tables, f"card {path}")
+    for variant in card.variants:
+        for name in tables.get("methods", {}):
+            if name in method_names():  # others come with packages that are not installed here
+                resolve(card, name, variant)
+    return card
+
+
+def resolve(
+    card: Card, method_name: str, variant: str = "default", sets: Sequence[str] = ()
+) -> Resolved:
+    """Combine method defaults, card, variant and ``--set`` into one configuration.
+
+    ``sets`` are ``PATH=TOML`` with the card's paths. Raises `UsageError` for an unknown name or
+    path and for an ill-typed value, always naming the path.
+    """
+    entry = method(method_name)
+    if variant not in card.variants:
+        raise UsageError(
+            f"task {card.name!r} has no variant {variant!r}: {nearest(variant, card.variants)}"
+        )
+    layers = [("card", card.tables), (f"variant {variant}", _variant(card, variant))]
+    layers += [("--set", assignment(text)) for text in sets]
+    merged: Table = {}
+    origins: dict[str, str] = {}
+    for origin, layer in layers:
+        _check_methods(layer, origin, card)
+        tree = {
+            "task": layer.get("task", {}),
+            "evaluation": layer.get("evaluation", {}),
+            "method": layer.get("methods", {}).get(method_name, {}),
+        }
+        _merge(merged, deepcopy(tree))
+        origins.update({path: origin for path in _leaves(tree)})
+    where = f"task {card.name!r}, method {method_name!r}, variant {variant!r}"
+    configuration = Configuration.model_construct(
+        task=_validated(TaskSettings, merged["task"], where, "task"),
+        evaluation=_validated(EvaluationSettings, merged["evaluation"], where, "evaluation"),
+        method=_validated(settings_class(entry), merged["method"], where, f"methods.{method_name}"),
+    )
+    if configuration.task.observation.kind not in entry.observations:
+        raise UsageError(
+            f"method {method_name!r} learns from {' or '.join(entry.observations)} observations, "
+            f"task {card.name!r} gives {configuration.task.observation.kind}: choose another"
+        )
+    return Resolved(configuration, origins)
+
+
+def _variant(card: Card, variant: str) -> Table:
+    overrides: Table = card.tables.get("variants", {}).get(variant, {})
+    return overrides
+
+
+def _check_methods(layer: Table, origin: str, card: Card) -> None:
+    if origin == "card":
+        return
+    for key in layer:
+        if key not in ("task", "evaluation", "methods"):
+            raise UsageError(
+                f"{origin} of task {card.name!r}: unknown path {key!r}: "
+                "a path starts with task, evaluation or methods"
+            )
+    if origin == "--set":
+        for name in layer.get("methods", {}):
+            method(name)
+
+
+def assignment(text: str) -> Table:
+    """``a.b=TOML`` as nested tables. Raises `UsageError` when it is not of that form."""
+    path, separator, value = text.partition("=")
+    if not separator or not all(part.strip() for part in path.split(".")):
+        raise UsageError(f"--set {text!r}: expected PATH=VALUE, as in task.horizon=40")
+    try:
+        parsed = tomllib.loads(f"value = {value}")
+        tree: Any = parsed.pop("value")
+    except (tomllib.TOMLDecodeError, KeyError) as error:
+        raise UsageError(
+            f"--set {text!r}: {value!r} is not a TOML value (text needs quotes): {error}"
+        ) from error
+    if parsed:
+        raise UsageError(f"--set {text!r}: one value only; repeat --set for another")
+    for part in reversed(path.split(".")):
+        tree = {part.strip(): tree}
+    return dict(tree)
+
+
+def _merge(base: Table, over: Table) -> None:
+    """Lay ``over`` onto ``base`` in place; tables merge, everything else is replaced."""
+    for key, value in over.items():
+        if isinstance(value, dict) and isinstance(base.get(key), dict):
+            _merge(base[key], value)
+        else:
+            base[key] = value
+
+
+def _leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterable[str]:
+    for key, value in tree.items():
+        path = f"{prefix}{key}"
+        if isinstance(value, dict):
+            yield from _leaves(value, f"{path}.")
+        else:
+            yield path
+
+
+def _validated(model: type[S], table: Any, where: str, path: str = "") -> S:
+    """Validate, or say every mistake in one line: where, which key, what was expected."""
+    try:
+        return model.model_validate(table)
+    except ValidationError as error:
+        mistakes = []
+        for fault in error.errors(include_url=False):
+            key = ".".join([path] * bool(path) + [str(part) for part in fault["loc"]])
+            if fault["type"] == "extra_forbidden":
+                siblings = _siblings(model, fault["loc"])
+                mistakes.append(f"unknown key {key!r} ({nearest(str(fault['loc'][-1]), siblings)})")
+            else:
+                given = "" if fault["type"] == "missing" else f", not {fault['input']!r}"
+                mistakes.append(f"{key!r}: {fault['msg']}{given}")
+        raise UsageError(f"{where}: {'; '.join(mistakes)}") from error
+
+
+def _siblings(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
+    """The keys that stand beside an unknown one."""
+    for part in location[:-1]:
+        field = model.model_fields.get(str(part))
+        if field is None or not (
+            isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)
+        ):
+            return []
+        model = field.annotation
+    return list(model.model_fields)

@@ -1,0 +1,143 @@
+"""The cell: task x method x variant x seed with its configuration, named by a hash of it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+from solar_cli.errors import UsageError
+from solar_cli.settings.card import NAME, Card, Configuration, resolve
+from solar_cli.settings.registry import method, settings_class
+from solar_cli.settings.schema import hashed_values
+from solar_cli.settings.task import EvaluationSettings, TaskSettings
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What one run computes."""
+
+    task: str
+    method: str
+    variant: str
+    seed: int
+    configuration: Configuration
+
+    @cached_property
+    def hash(self) -> str:
+        """Sixteen hexadecimal digits, of whatever can change a number that is stored.
+
+        The stopping point is not in it: asking for more episodes continues the same cell.
+        """
+        identity = {
+            "task": self.task,
+            "method": self.method,
+            "variant": self.variant,
+            "seed": self.seed,
+            "configuration": {
+                "task": hashed_values(self.configuration.task),
+                "evaluation": hashed_values(self.configuration.evaluation),
+                "method": hashed_values(self.configuration.method),
+            },
+        }
+        text = json.dumps(identity, sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+    @property
+    def title(self) -> str:
+        """As a person names it: ``nav/solar seed 3``, with the variant where it is not default."""
+        variant = "" if self.variant == "default" else f":{self.variant}"
+        return f"{self.task}/{self.method}{variant} seed {self.seed}"
+
+    def budget(self, wanted: Literal["desk", "full"] | int) -> int:
+        """Episodes to stop at."""
+        if isinstance(wanted, int):
+            return wanted
+        episodes: int = getattr(self.configuration.method.budget, wanted)  # type: ignore[attr-defined]
+        return episodes
+
+    def config(self) -> dict[str, Any]:
+        """The whole configuration as plain JSON data, to be stored."""
+        parts = self.configuration
+        return {
+            "task": parts.task.model_dump(mode="json"),
+            "evaluation": parts.evaluation.model_dump(mode="json"),
+            "method": parts.method.model_dump(mode="json"),
+        }
+
+
+def restore(task: str, method_name: str, variant: str, seed: int, config: dict[str, Any]) -> Cell:
+    """The cell of a stored configuration; settings that came later take their defaults."""
+    configuration = Configuration.model_construct(
+        task=TaskSettings.model_validate(config["task"]),
+        evaluation=EvaluationSettings.model_validate(config["evaluation"]),
+        method=settings_class(method(method_name)).model_validate(config["method"]),
+    )
+    return Cell(task, method_name, variant, seed, configuration)
+
+
+def cells(
+    card: Card,
+    method_name: str,
+    seeds: Sequence[int],
+    variant: str = "default",
+    sets: Sequence[str] = (),
+    label: str | None = None,
+) -> list[Cell]:
+    """The cells of one task and method, one a seed."""
+    configuration = resolve(card, method_name, variant, sets).configuration
+    name = variant_name(variant, sets, label)
+    return [Cell(card.name, method_name, name, seed, configuration) for seed in seeds]
+
+
+def variant_name(variant: str, sets: Sequence[str], label: str | None) -> str:
+    """The name of a variant made by ``--set``: its label, or what it changes."""
+    if label is not None:
+        if not NAME.match(label) or label == "default":
+            raise UsageError(
+                f"--label {label!r}: use lower-case letters, digits, '-', '_' and '.', "
+                "and not 'default'"
+            )
+        return label
+    if not sets:
+        return variant
+    changes = []
+    for text in sorted(sets):
+        path, _, value = text.partition("=")
+        key = path.split(".")[-1].strip()
+        changes.append(f"{key}-{re.sub('[^a-z0-9.]+', '-', value.lower()).strip('-')}")
+    return "_".join([variant] * (variant != "default") + changes)
+
+
+def parse_seeds(text: str) -> list[int]:
+    """``3`` is 0, 1, 2; ``3,5,8`` are those; ``0:10`` is 0 to 9 and ``5:6`` is 5."""
+    try:
+        if ":" in text:
+            first, last = (int(part) for part in text.split(":"))
+            seeds = list(range(first, last))
+        elif "," in text:
+            seeds = [int(part) for part in text.split(",") if part.strip()]
+        else:
+            seeds = list(range(int(text)))
+    except ValueError as error:
+        raise UsageError(
+            f"--seeds {text!r}: expected a number of seeds (3), a list (3,5,8) or a range (0:10)"
+        ) from error
+    if not seeds or min(seeds) < 0 or len(set(seeds)) < len(seeds) or max(seeds) >= 2**31:
+        raise UsageError(f"--seeds {text!r}: expected at least one seed, each once, from 0 up")
+    return seeds
+
+
+def parse_budget(text: str) -> Literal["desk", "full"] | int:
+    """``desk``, ``full`` or a number of episodes."""
+    if text == "desk":
+        return "desk"
+    if text == "full":
+        return "full"
+    if not text.isdecimal() or int(text) == 0:
+        raise UsageError(f"--budget {text!r}: expected desk, full or a number of episodes above 0")
+    return int(text)

@@ -1,0 +1,157 @@
+"""Settings of the local methods: a representation + a local dynamics fit + KL-constrained LQR."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from solar_cli.settings.networks import FULLY_CONNECTED, KEY_POINTS, Layer
+from solar_cli.settings.schema import Settings, setting
+
+
+class Budget(Settings):
+    """Where to stop, in episodes; never part of a cell's identity."""
+
+    desk: int = setting(..., "episodes for an evening", presentation=True, ge=1)
+    full: int = setting(..., "episodes of the paper", presentation=True, ge=1)
+
+
+class Batches(Settings):
+    """Episodes an iteration collects (Algorithm 1, line 4)."""
+
+    initial: int = setting(..., "white-noise episodes before the first model", "App. D", ge=2)
+    noisy: int = setting(..., "episodes of the policy with its noise, an iteration", "App. D", ge=2)
+    noise_free: int = setting(
+        0, "further episodes an iteration without noise, which judge the policy", ge=0
+    )
+
+
+class Representation(Settings):
+    """Recognition model e(s) and observation model f(z) (section 3)."""
+
+    latent: int = setting(8, "dimensions of the latent block of one frame", "App. D", ge=1)
+    encoder: tuple[Layer, ...] = setting(KEY_POINTS, "recognition network, applied to each frame")
+    head: Literal["linear", "none"] = setting(
+        "linear", "linear map from the last layer to the latent mean, or the layer itself"
+    )
+    variance: float | Literal["learned"] = setting(
+        "learned", "variance of q(z|s): a learned diagonal, or this number"
+    )
+    decoder: tuple[Layer, ...] = setting(FULLY_CONNECTED, "hidden layers of the observation model")
+    likelihood: Literal["calibrated", "bernoulli", "categorical", "gaussian"] = setting(
+        "calibrated",
+        "p(s|z): Gaussian with the best common scale on an image pyramid, or as App. D says",
+    )
+    input: Literal["standardised", "unit"] = setting(
+        "standardised", "(x - mean image) / pixel std, or x in [0, 1]"
+    )
+
+
+class Dynamics(Settings):
+    """The Bayesian linear dynamical system over latents (Eq. 2-5)."""
+
+    factors: Literal["shared", "varying"] = setting(
+        "shared", "one q(F, Sigma) for all time steps, or one a time step as in Eq. 5"
+    )
+    rows: Literal["newest", "all"] = setting(
+        "newest", "model the newest latent block (the rest shifts), or the whole z_{t+1}"
+    )
+    prior_scale: float = setting(1e-3, "Psi_0 = this x (nu_0 + d + 1) I, nu_0 = d + 2", gt=0)
+    prior_precision: float = setting(1e-2, "V_0^-1 = this x I", gt=0)
+    rate: float = setting(0.02, "natural-gradient step (Eq. 6); 1 is the closed form", gt=0, le=1)
+
+
+class Training(Settings):
+    """Stochastic maximisation of the ELBO (section 3)."""
+
+    steps: int = setting(2000, "gradient steps of the first training", ge=1)
+    fine_tune_steps: int = setting(0, "gradient steps in later iterations; 0 freezes e(s)", ge=0)
+    buffer: int = setting(3, "B: batches that later trainings draw from", "Alg. 1", ge=1)
+    segments: int = setting(10, "segments of consecutive frames a step", ge=1)
+    length: int = setting(12, "frames of a segment", ge=2)
+    decoded: float = setting(0.5, "share of a step's frames that are decoded", gt=0, le=1)
+    learning_rate: float = setting(2e-3, "Adam", gt=0)
+    schedule: Literal["cosine", "constant"] = setting("cosine", "of the learning rate")
+    clip: float = setting(50.0, "largest norm of the gradient", gt=0)
+    kl_start: float = setting(1e-4, "weight of the KL terms at first", gt=0)
+    kl_end: float = setting(1.0, "weight of the KL terms at last", gt=0)
+    kl_hold: float = setting(0.2, "share of the steps with the first weight", ge=0, le=1)
+    kl_ramp: float = setting(0.3, "share of the steps over which it rises", ge=0, le=1)
+    standard_normal: float = setting(0.05, "weight of a further KL to N(0, I)", ge=0)
+    held_out: float = setting(0.15, "share of the collected episodes kept for scoring", gt=0, lt=1)
+    attempts: int = setting(3, "trainings at most, when a representation looks dead", ge=1)
+
+
+class LocalFit(Settings):
+    """INFERDYNAMICS: where the prior of a time step's posterior comes from (section 4.1)."""
+
+    method: Literal["posterior", "regression", "gmm"] = setting(
+        "posterior", "posterior inference; least squares; a Gaussian-mixture prior (LQR-FLM)"
+    )
+    prior_counts: tuple[float, ...] = setting(
+        (1.0, 10.0, 100.0), "pseudo-counts of the global factor, chosen by held-out likelihood"
+    )
+    widths: tuple[float, ...] = setting(
+        (2.0, 5.0), "reach of neighbouring time steps, chosen by held-out likelihood"
+    )
+    neighbours: tuple[float, ...] = setting(
+        (0.0, 0.5), "weight of neighbouring time steps, chosen by held-out likelihood"
+    )
+    older_counts: tuple[float, ...] = setting(
+        (0.0, 10.0), "pseudo-counts of older batches, chosen by held-out likelihood"
+    )
+    older_batches: int = setting(3, "older batches that may be used", ge=0)
+    folds: int = setting(3, "folds of the held-out likelihood", ge=2)
+    ridge: float = setting(0.003, "noise of a latent, in units of its std, that slopes must bear")
+
+
+class CostFit(Settings):
+    """c_t = 1/2 z^T L L^T z + c^T z + alpha |a|^2 + b (section 3)."""
+
+    optimiser: Literal["lbfgs", "sgd"] = setting("lbfgs", "of the squared error")
+    width: float = setting(5.0, "reach in time steps of a per-time fit", gt=0)
+    per_time: Literal["chosen", "never"] = setting(
+        "chosen", "a fit per time step where held-out R2 says so, or never"
+    )
+    terminal: float = setting(3.0, "weight of the cost of the last state", gt=0)
+
+
+class PolicyUpdate(Settings):
+    """KL-constrained LQR and the rules around it (section 4.2)."""
+
+    kl_step: float | Literal["unbounded"] = setting(
+        0.5, "nats a time step that the trajectory distribution may move"
+    )
+    multiplier: tuple[float, float] = setting((0.3, 2.0), "bounds of the adaptive step size")
+    linearise: bool = setting(True, "line 6 of Algorithm 1, when e(s) has changed")
+    reject: float | Literal["never"] = setting(
+        1.0, "standard errors by which a batch may be worse than the best before going back"
+    )
+    std_floor: tuple[float, float] = setting(
+        (0.67, 0.33), "least std over the initial one: first updates, later ones"
+    )
+    std_ceiling: float = setting(2.0, "largest std over the initial one", gt=0)
+    early_updates: int = setting(3, "updates that the first floor holds for", ge=0)
+
+
+class LocalMethod(Settings):
+    """A local method in the latent space: SOLAR and its ablations."""
+
+    batches: Batches = setting(..., "line 4 of Algorithm 1")
+    budget: Budget = setting(..., "where to stop", presentation=True)
+    representation: Representation = setting(Representation(), "networks")
+    training: Training = setting(Training(), "line 5 of Algorithm 1")
+    local_fit: LocalFit = setting(LocalFit(), "line 7 of Algorithm 1")
+    cost_fit: CostFit = setting(CostFit(), "quadratic cost")
+    update: PolicyUpdate = setting(PolicyUpdate(), "lines 6 and 8 of Algorithm 1")
+
+
+class Solar(LocalMethod):
+    """SOLAR: the representation has a Bayesian linear dynamical system as its prior."""
+
+    dynamics: Dynamics = setting(Dynamics(), "the model's prior over latent dynamics")
+
+
+class Vae(LocalMethod):
+    """The VAE ablation: a standard-normal prior, local dynamics with a Gaussian-mixture prior."""
+
+    local_fit: LocalFit = setting(LocalFit(method="gmm"), "line 7 of Algorithm 1")

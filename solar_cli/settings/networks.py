@@ -1,0 +1,69 @@
+"""Networks as a card writes them: a list of layers, each a table with a ``kind``."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from solar_cli.settings.schema import Settings, setting
+
+
+class Unshuffle(Settings):
+    """Space to depth: (C, H, W) -> (C f^2, H/f, W/f)."""
+
+    kind: Literal["unshuffle"] = "unshuffle"
+    factor: int = setting(..., "side of the blocks that become channels", ge=1)
+
+
+class Conv(Settings):
+    """A convolution without padding tricks: output side = (side + 2 padding - size)/stride + 1."""
+
+    kind: Literal["conv"] = "conv"
+    channels: int = setting(..., "output channels", ge=1)
+    size: int = setting(3, "side of the square filter", ge=1)
+    stride: int = setting(1, "stride", ge=1)
+    padding: int = setting(0, "zeros on every side", ge=0)
+    groups: int = setting(1, "independent towers that share no channel", ge=1)
+    activation: Literal["relu", "none"] = setting("relu", "what follows")
+    pool: int = setting(1, "side of the max-pooling that follows", ge=1)
+
+
+class SpatialSoftmax(Settings):
+    """Expected image coordinates of every channel, in [-1, 1] (Finn et al. 2016)."""
+
+    kind: Literal["spatial_softmax"] = "spatial_softmax"
+    log_temperature: float = setting(1.0, "initial log of the inverse temperature, learned")
+
+
+class Linear(Settings):
+    """A fully connected layer on the flattened input."""
+
+    kind: Literal["linear"] = "linear"
+    width: int = setting(..., "outputs", ge=1)
+    activation: Literal["relu", "none"] = setting("relu", "what follows")
+
+
+class Deconv(Settings):
+    """A transposed convolution; the first of a list reads a vector as (channels, 1, 1)."""
+
+    kind: Literal["deconv"] = "deconv"
+    channels: int = setting(..., "output channels", ge=1)
+    size: int = setting(..., "side of the square filter", ge=1)
+    stride: int = setting(1, "stride", ge=1)
+    activation: Literal["relu", "none"] = setting("relu", "what follows")
+
+
+Layer = Annotated[Unshuffle | Conv | SpatialSoftmax | Linear | Deconv, Field(discriminator="kind")]
+
+KEY_POINTS: tuple[Layer, ...] = (
+    Unshuffle(factor=4),
+    Conv(channels=16, size=3, padding=1),
+    Conv(channels=16, size=3, padding=1),
+    Conv(channels=32, size=1, activation="none"),
+    SpatialSoftmax(log_temperature=1.0),
+)
+"""Our encoder for every image task: key points of a frame at a quarter of its resolution."""
+
+FULLY_CONNECTED: tuple[Layer, ...] = (Linear(width=256), Linear(width=256), Linear(width=256))
+"""Our decoder for every image task."""

@@ -1,0 +1,71 @@
+"""What every settings model shares: frozen, unknown keys refused, one description and source a field.
+
+The hash of a cell is made of every field, but for two kinds, marked where they are declared:
+
+* ``presentation``: shapes a report, never a number that is stored;
+* ``added``: came after the first release. At the value that old runs had in effect it is left out,
+  so that old cells keep their hash.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+from pydantic.fields import FieldInfo
+
+OURS = "ours"
+"""Source of a value that the paper does not give or that we chose otherwise."""
+
+
+class Settings(BaseModel):
+    """Base of all settings."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+def setting(
+    default: Any,
+    description: str,
+    source: str = OURS,
+    *,
+    presentation: bool = False,
+    added: Any = ...,
+    **constraints: Any,
+) -> Any:
+    """Declare one setting; pass ``...`` as the default of a required one.
+
+    ``added`` is the value that a run made before this setting existed had in effect.
+    """
+    extra: dict[str, Any] = {"source": source, "presentation": presentation}
+    if added is not ...:
+        extra["added"] = added
+    return Field(default, description=description, json_schema_extra=extra, **constraints)
+
+
+def _extra(field: FieldInfo) -> dict[str, Any]:
+    return field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
+
+
+def hashed_values(settings: BaseModel) -> dict[str, Any]:
+    """The part of ``settings`` that can change a stored number, as plain JSON data."""
+    values: dict[str, Any] = {}
+    dumped = settings.model_dump(mode="json")
+    for name, field in type(settings).model_fields.items():
+        extra = _extra(field)
+        if extra.get("presentation"):
+            continue
+        value = getattr(settings, name)
+        if "added" in extra and dumped[name] == extra["added"]:
+            continue
+        values[name] = hashed_values(value) if isinstance(value, BaseModel) else dumped[name]
+    return values
+
+
+def source_of(settings: type[BaseModel], path: tuple[str, ...]) -> tuple[str, str]:
+    """Description and source of the field at ``path`` below a settings class."""
+    field = settings.model_fields[path[0]]
+    inner = field.annotation
+    if len(path) > 1 and isinstance(inner, type) and issubclass(inner, BaseModel):
+        return source_of(inner, path[1:])
+    return field.description or "", str(_extra(field).get("source", ""))
