@@ -65,6 +65,7 @@ class Training(Settings):
 
     steps: int = setting(2000, "gradient steps of the first training", ge=1)
     fine_tune_steps: int = setting(0, "gradient steps in later iterations; 0 freezes e(s)", ge=0)
+    fine_tune_rate: float = setting(3e-4, "Adam, in later iterations", gt=0)
     buffer: int = setting(3, "B: batches that later trainings draw from", "Alg. 1", ge=1)
     segments: int = setting(10, "segments of consecutive frames a step", ge=1)
     length: int = setting(12, "frames of a segment", ge=2)

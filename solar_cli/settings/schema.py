@@ -1,4 +1,4 @@
-"""What every settings model shares: frozen, unknown keys refused, one description and source a field.
+"""What all settings share: frozen, unknown keys refused, a description and a source for each field.
 
 The hash of a cell is made of every field, but for two kinds, marked where they are declared:
 

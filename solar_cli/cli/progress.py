@@ -1,0 +1,150 @@
+"""Progress of a running matrix: a live table on a terminal, else plain lines or lines of JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from solar_cli.cli.printing import console, duration, number, print_json, say, table
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from solar_cli.experiment.scheduler import Event
+
+COLUMNS = ("running", "iteration>", "episodes>", "headline measure>", "doing", "time left>")
+Report = Callable[["Event"], None]
+
+
+@contextmanager
+def watching(json: bool) -> Iterator[Report]:
+    """What the scheduler reports its events to, as long as the matrix runs."""
+    if json:
+        yield Lines(json_line)
+    elif console().is_terminal:
+        from rich.live import Live
+
+        board = Board()
+        with Live(get_renderable=board.table, console=console(), transient=True) as live:
+
+            def report(event: Event) -> None:
+                if board.take(event) and (line := plain_line(event)):
+                    live.console.print(line)
+
+            yield report
+    else:
+        yield Lines(say_line)
+
+
+class Board:
+    """The cells that are running, newest state of each."""
+
+    def __init__(self) -> None:
+        self.running: dict[str, Event] = {}
+
+    def take(self, event: Event) -> bool:
+        """Keep the news; whether it is an end."""
+        key = event.plan.cell.hash
+        if event.kind == "ended":
+            self.running.pop(key, None)
+            return True
+        self.running[key] = event
+        return False
+
+    def table(self) -> Table:
+        """One row a running cell."""
+        return table(COLUMNS, [row(event) for event in self.running.values()])
+
+
+def row(event: Event) -> tuple[object, ...]:
+    """What the live table says of a cell."""
+    plan, message = event.plan, event.message
+    if message is None:
+        return (plan.cell.title, "", f"0/{plan.target}", "", "starting", "")
+    return (
+        plan.cell.title,
+        message.iteration,
+        f"{message.episodes}/{plan.target}",
+        headline(event),
+        f"{message.activity} {message.fraction:.0%}" if message.fraction else message.activity,
+        duration(event.seconds_left),
+    )
+
+
+def headline(event: Event) -> str:
+    """``final_distance 0.04``, or nothing before the first evaluation."""
+    message = event.message
+    if message is None or message.headline is None:
+        return ""
+    return f"{event.plan.cell.configuration.evaluation.headline} {number(message.headline)}"
+
+
+class Lines:
+    """Passes on starts, ends, and every cell's new iterations: enough for a log."""
+
+    def __init__(self, emit: Report) -> None:
+        self._emit = emit
+        self._iterations: dict[str, int] = {}
+
+    def __call__(self, event: Event) -> None:
+        """Hear an event."""
+        key, message = event.plan.cell.hash, event.message
+        if event.kind == "progress":
+            iteration = -1 if message is None else message.iteration
+            if self._iterations.get(key) == iteration:
+                return
+            self._iterations[key] = iteration
+        self._emit(event)
+
+
+def plain_line(event: Event) -> str:
+    """An event as a line of text."""
+    title, message, result = event.plan.cell.title, event.message, event.result
+    if event.kind == "started":
+        return f"{title}: started"
+    where = (
+        ""
+        if message is None
+        else f"iteration {message.iteration}, {message.episodes}/{event.plan.target} episodes"
+    )
+    if event.kind == "ended" and result is not None:
+        outcome = "not started" if result.outcome is None else result.outcome.value
+        parts = [f"{title}: {outcome}", where, headline(event), result.cause]
+    else:
+        left = f"{duration(event.seconds_left)} left" if event.seconds_left else ""
+        parts = [f"{title}: {where}", headline(event), left]
+    return ", ".join(part for part in parts if part)
+
+
+def say_line(event: Event) -> None:
+    """Print an event as text, at once, as whoever follows a log expects."""
+    import sys
+
+    say(plain_line(event))
+    sys.stdout.flush()
+
+
+def json_line(event: Event) -> None:
+    """Print an event as one line of JSON."""
+    import sys
+
+    message, result = event.message, event.result
+    print_json(
+        {
+            "event": event.kind,
+            "cell": event.plan.cell.hash,
+            "title": event.plan.cell.title,
+            "target": event.plan.target,
+            "iteration": None if message is None else message.iteration,
+            "episodes": None if message is None else message.episodes,
+            "headline": event.plan.cell.configuration.evaluation.headline,
+            "value": None if message is None else message.headline,
+            "activity": None if message is None else message.activity,
+            "fraction": None if message is None else message.fraction,
+            "seconds_left": event.seconds_left,
+            "outcome": None if result is None or result.outcome is None else result.outcome.value,
+            "cause": None if result is None else result.cause,
+        }
+    )
+    sys.stdout.flush()

@@ -1,0 +1,1 @@
+"""Time-varying linear-Gaussian policies, the KL-constrained LQR, planners."""

@@ -1,0 +1,106 @@
+"""Which episodes an update starts from: the newest ones, or the best so far when those are worse.
+
+Costs of episodes are noisy, so a batch counts as worse only by its standard error. Judged by
+collected episodes alone.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any, Literal, NamedTuple
+
+from solar_cli.control.linear_gaussian import LinearGaussianPolicy
+from solar_cli.control.step_size import StepSize
+from solar_cli.episodes import Episodes
+
+
+class Anchor(NamedTuple):
+    """A policy that was tried, the iteration that holds its episodes, and what they cost."""
+
+    iteration: int
+    gains: LinearGaussianPolicy
+    cost: float
+    """mean of the sum over an episode"""
+    error: float
+    """its standard error"""
+
+    @staticmethod
+    def of(iteration: int, gains: LinearGaussianPolicy, episodes: Episodes) -> Anchor:
+        """Judge a batch by the cost of its episodes."""
+        totals = episodes.costs.sum(axis=1)
+        error = totals.std(ddof=1) / math.sqrt(len(totals)) if len(totals) > 1 else 0.0
+        return Anchor(iteration, gains, float(totals.mean()), float(error))
+
+
+@dataclass(frozen=True)
+class TrustRegion:
+    """The best policy so far, the one to build upon, and how far to step."""
+
+    step: StepSize
+    best: Anchor | None = None
+    current: Anchor | None = None
+    promised: float = math.nan
+    """fall of the cost that the last update predicted"""
+    kept: float = math.nan
+    """fall of the cost that was measured for it"""
+    rejected: bool = False
+    """whether the last policy was worse than the best, and taken back"""
+
+    def judged(self, tried: Anchor, tolerance: float | Literal["never"]) -> TrustRegion:
+        """Build upon what was just tried, or go back to the best; the step is adapted."""
+        if self.best is None or self.current is None:
+            return replace(self, best=tried, current=tried)
+        kept = self.current.cost - tried.cost
+        margin = math.hypot(tried.error, self.best.error)
+        if tolerance != "never" and tried.cost > self.best.cost + tolerance * margin:
+            step = self.step.after_rejection()
+            return replace(self, current=self.best, step=step, kept=kept, rejected=True)
+        return replace(
+            self,
+            step=self.step.after(self.promised, kept),
+            best=tried if tried.cost < self.best.cost else self.best,
+            current=tried,
+            kept=kept,
+            rejected=False,
+        )
+
+    def metrics(self) -> dict[str, float]:
+        """What the last update promised, what it gave, and what follows."""
+        return {
+            "predicted_improvement": self.promised,
+            "actual_improvement": self.kept,
+            "rejected": float(self.rejected),
+            "step_multiplier": self.step.multiplier,
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """Plain data and tensors."""
+        return {
+            "multiplier": self.step.multiplier,
+            "best": _plain(self.best),
+            "current": _plain(self.current),
+            "promised": self.promised,
+        }
+
+    def restored(self, state: dict[str, Any]) -> TrustRegion:
+        """This trust region's bounds with a saved state."""
+        return replace(
+            self,
+            step=replace(self.step, multiplier=state["multiplier"]),
+            best=_anchor(state["best"]),
+            current=_anchor(state["current"]),
+            promised=state["promised"],
+        )
+
+
+def _plain(anchor: Anchor | None) -> dict[str, Any] | None:
+    if anchor is None:
+        return None
+    return {**anchor._asdict(), "gains": [gain.clone() for gain in anchor.gains]}
+
+
+def _anchor(state: dict[str, Any] | None) -> Anchor | None:
+    if state is None:
+        return None
+    return Anchor(**{**state, "gains": LinearGaussianPolicy(*state["gains"])})

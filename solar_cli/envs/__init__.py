@@ -1,0 +1,43 @@
+"""Simulators, batched over episodes: one interface for every task (`solar_cli.envs.task`).
+
+A simulator is a module with two functions, ``build(settings) -> Task`` and
+``picture(frames, factor) -> (..., H factor, W factor, 3)`` in [0, 1], and a line in `SIMULATORS`.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from types import ModuleType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from solar_cli.envs.task import Frames, Task
+from solar_cli.errors import UsageError, nearest
+from solar_cli.settings import TaskSettings
+
+__all__ = ["SIMULATORS", "Task", "build_task", "picture"]
+
+SIMULATORS = {"navigation": "solar_cli.envs.navigation"}
+"""name on a card -> module, imported when used"""
+
+
+def build_task(settings: TaskSettings) -> Task:
+    """The task that ``settings`` describe. Raises `UsageError` for what its simulator lacks."""
+    task: Task = _simulator(settings).build(settings)
+    return task
+
+
+def picture(settings: TaskSettings, frames: Frames, factor: int = 8) -> NDArray[np.uint8]:
+    """Learner frames (..., C, H, W) as pictures for people, RGB (..., H factor, W factor, 3)."""
+    colours: NDArray[np.float64] = _simulator(settings).picture(frames, factor)
+    return np.rint(255.0 * colours).astype(np.uint8)
+
+
+def _simulator(settings: TaskSettings) -> ModuleType:
+    if settings.simulator not in SIMULATORS:
+        raise UsageError(
+            f"task.simulator: no simulator is named {settings.simulator!r}: "
+            f"{nearest(settings.simulator, SIMULATORS)}"
+        )
+    return import_module(SIMULATORS[settings.simulator])

@@ -1,0 +1,133 @@
+"""The one interface that a method meets, batched over episodes, and the class behind our own tasks.
+
+Axes: N episodes, C channels, H rows, W columns, S entries of a state, a entries of an action,
+k numbers that describe a simulator's state. Windows of frames are made by whoever needs them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from solar_cli.errors import UsageError, nearest
+from solar_cli.settings import TaskSettings
+
+Floats = NDArray[np.float64]
+Frames = NDArray[Any]
+"""(N, C, H, W) uint8 images or (N, S) float32 states; never shared between calls"""
+
+
+class Task(Protocol):
+    """An episodic control problem; episodes are run whole, all at once."""
+
+    horizon: int
+    """T: actions an episode has"""
+    action_size: int
+    action_bound: float
+    """largest absolute value of an action entry; larger ones are clipped"""
+    truth_names: tuple[str, ...]
+    """what the columns of `truth` are"""
+
+    def reset(self, streams: Sequence[np.random.Generator]) -> Frames:
+        """Start one episode for each stream, which alone decides its initial state."""
+
+    def step(self, actions: Floats) -> tuple[Frames, Floats]:
+        """Execute actions (N, a): the next frames, and the costs (N,) of state and action.
+
+        The cost is that of the state before the step and of the action after clipping.
+        """
+
+    def measures(self) -> dict[str, Floats]:
+        """Ground truth of the current states, (N,) each; to judge a policy, never to learn from."""
+
+    def truth(self) -> Floats:
+        """True positions (N, len(truth_names)) of the current states, to diagnose latents with."""
+
+
+class RowSimulator(Protocol):
+    """An own simulator: pure functions over rows (N, k), one row an episode."""
+
+    truth_names: tuple[str, ...]
+
+    def initial(self, stream: np.random.Generator) -> Floats:
+        """The row (k,) that an episode starts from."""
+
+    def dynamics(self, rows: Floats, actions: Floats) -> Floats:
+        """The rows after actions (N, a), which are within their bounds."""
+
+    def cost(self, rows: Floats, actions: Floats) -> Floats:
+        """Costs (N,)."""
+
+    def scenes(self, rows: Floats) -> Frames:
+        """What every frame of an episode shows, drawn once an episode."""
+
+    def draw(self, rows: Floats, scenes: Frames) -> Frames:
+        """New frames: the scenes with what moves."""
+
+    def measures(self, rows: Floats) -> dict[str, Floats]:
+        """As `Task.measures`."""
+
+    def truth(self, rows: Floats) -> Floats:
+        """As `Task.truth`."""
+
+
+class RowTask:
+    """A `Task` made of a `RowSimulator`: it holds the rows and clips the actions."""
+
+    def __init__(self, simulator: RowSimulator, settings: TaskSettings) -> None:
+        self.horizon = settings.horizon
+        self.action_size = settings.action.size
+        self.action_bound = settings.action.bound
+        self.truth_names = simulator.truth_names
+        self._simulator = simulator
+        self._rows: Floats = np.empty((0, 0))
+        self._scenes: Frames = np.empty((0, 0))
+
+    def reset(self, streams: Sequence[np.random.Generator]) -> Frames:
+        """As `Task.reset`."""
+        # One draw a row, so that an episode does not depend on those beside it.
+        self._rows = np.stack([self._simulator.initial(stream) for stream in streams])
+        self._scenes = self._simulator.scenes(self._rows)
+        return self._simulator.draw(self._rows, self._scenes)
+
+    def restart(self, which: NDArray[np.intp], streams: Sequence[np.random.Generator]) -> Frames:
+        """Start new episodes in the rows ``which``, the others go on; returns the new frames."""
+        rows = np.stack([self._simulator.initial(stream) for stream in streams])
+        scenes = self._simulator.scenes(rows)
+        self._rows[which] = rows
+        self._scenes[which] = scenes
+        return self._simulator.draw(rows, scenes)
+
+    def step(self, actions: Floats) -> tuple[Frames, Floats]:
+        """As `Task.step`; raises `ValueError` for actions of another shape."""
+        if actions.shape != (expected := (len(self._rows), self.action_size)):
+            raise ValueError(
+                f"actions have shape {actions.shape}, expected {expected}: reset first, then give "
+                "one action for each episode"
+            )
+        executed = np.clip(actions, -self.action_bound, self.action_bound)
+        costs = self._simulator.cost(self._rows, executed)
+        self._rows = self._simulator.dynamics(self._rows, executed)
+        return self._simulator.draw(self._rows, self._scenes), costs
+
+    def measures(self) -> dict[str, Floats]:
+        """As `Task.measures`."""
+        return self._simulator.measures(self._rows)
+
+    def truth(self) -> Floats:
+        """As `Task.truth`."""
+        return self._simulator.truth(self._rows)
+
+
+def check_parameters(settings: TaskSettings, known: Iterable[str]) -> None:
+    """Refuse parameters that the simulator does not know, with a `UsageError`."""
+    known = tuple(known)
+    for name in settings.parameters:
+        if name not in known:
+            raise UsageError(
+                f"task.parameters: simulator {settings.simulator!r} has no parameter {name!r}: "
+                f"{nearest(name, known)}"
+            )

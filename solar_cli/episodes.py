@@ -1,0 +1,301 @@
+"""Episodes: the one currency of all methods; collecting, keeping and evaluating them.
+
+Axes: N episodes, T actions an episode, W frames an observation window, a entries of an action.
+A learner sees frames, actions and costs. Ground truth (measures, true positions) is kept apart, in
+`Evaluation` and in the ledger's summaries, out of a learner's reach.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from solar_cli.envs.task import Task
+from solar_cli.settings import TaskSettings
+from solar_cli.streams import Streams
+
+Floats = NDArray[np.float64]
+
+
+class Policy(Protocol):
+    """What acts. Noise is drawn when an episode starts, so that it may be smooth over time."""
+
+    def start(self, episodes: int, stream: np.random.Generator | None) -> Any:
+        """The state that ``act`` carries; without a stream the policy is noise-free."""
+
+    def act(self, observations: NDArray[Any], t: int, state: Any) -> tuple[Floats, Floats, Any]:
+        """Actions (N, a) for windows (N, W, *frame) at step ``t``, their means, the state."""
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """Trajectories as batched arrays; each frame is held once, windows are index views."""
+
+    frames: NDArray[Any]
+    """(N, T+1, C, H, W) uint8 or (N, T+1, S) float32"""
+    actions: Floats
+    """(N, T, a) as executed, after clipping"""
+    action_means: Floats
+    """(N, T, a) what the policy would have done without noise"""
+    costs: Floats
+    """(N, T) of the state and the executed action of each step"""
+    window: int = 1
+    """frames an observation holds"""
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    @property
+    def horizon(self) -> int:
+        """T: actions an episode has."""
+        return int(self.actions.shape[1])
+
+    def __getitem__(self, rows: Any) -> Episodes:
+        return Episodes(
+            self.frames[rows],
+            self.actions[rows],
+            self.action_means[rows],
+            self.costs[rows],
+            self.window,
+        )
+
+    @staticmethod
+    def joined(parts: Sequence[Episodes]) -> Episodes:
+        """All episodes of several batches, in order."""
+        return Episodes(
+            np.concatenate([part.frames for part in parts]),
+            np.concatenate([part.actions for part in parts]),
+            np.concatenate([part.action_means for part in parts]),
+            np.concatenate([part.costs for part in parts]),
+            parts[0].window,
+        )
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Episodes with the ground truth that only a judge may see."""
+
+    episodes: Episodes
+    measures: Mapping[str, Floats]
+    """name -> (N, T+1)"""
+    truth: Floats
+    """(N, T+1, k) true positions, to diagnose latents with"""
+    truth_names: tuple[str, ...] = ()
+
+    def summary(self) -> dict[str, Floats]:
+        """One number an episode: return, and each measure's final and mean value."""
+        summary = {"return": -self.episodes.costs.sum(axis=1)}
+        for name, values in self.measures.items():
+            summary[f"final_{name}"] = values[:, -1]
+            summary[f"mean_{name}"] = values.mean(axis=1)
+        return summary
+
+
+def window_indices(horizon: int, window: int) -> NDArray[np.int64]:
+    """(T+1, W) frame numbers of every observation; before the start the first frame repeats."""
+    steps = np.arange(horizon + 1)[:, None] + np.arange(1 - window, 1)[None, :]
+    return np.asarray(np.maximum(steps, 0), np.int64)
+
+
+def roll_out(
+    task: Task,
+    settings: TaskSettings,
+    policy: Policy,
+    resets: Sequence[np.random.Generator],
+    noise: np.random.Generator | None,
+) -> Evaluation:
+    """Run one episode for each reset stream, all at once."""
+    count, horizon, window = len(resets), settings.horizon, settings.observation.window
+    index = window_indices(horizon, window)
+    first = task.reset(resets)
+    frames = np.empty((count, horizon + 1, *first.shape[1:]), first.dtype)
+    frames[:, 0] = first
+    actions = np.empty((count, horizon, settings.action.size))
+    means = np.empty_like(actions)
+    costs = np.empty((count, horizon))
+    measures, truths = [_ground_truth(task)[0]], [_ground_truth(task)[1]]
+    state = policy.start(count, noise)
+    for t in range(horizon):
+        wanted, means[:, t], state = policy.act(frames[:, index[t]], t, state)
+        actions[:, t] = np.clip(wanted, -settings.action.bound, settings.action.bound)
+        frames[:, t + 1], costs[:, t] = task.step(actions[:, t])
+        measured, truth = _ground_truth(task)
+        measures.append(measured)
+        truths.append(truth)
+    names = set(measures[0]).intersection(*measures)
+    return Evaluation(
+        Episodes(frames, actions, means, costs, window),
+        {name: np.stack([step[name] for step in measures], axis=1) for name in sorted(names)},
+        *_stacked(truths, task.truth_names),
+    )
+
+
+def _stacked(truths: list[Floats], names: tuple[str, ...]) -> tuple[Floats, tuple[str, ...]]:
+    """Positions of all steps, or none where one is missing."""
+    if any(truth.shape != (len(truths[-1]), len(names)) for truth in truths):
+        return np.empty((len(truths[-1]), len(truths), 0)), ()
+    return np.stack(truths, axis=1), names
+
+
+def _ground_truth(task: Task) -> tuple[dict[str, Floats], Floats]:
+    """Measures and true positions, or none: a judge that fails must not stop a learner."""
+    try:
+        return dict(task.measures()), task.truth()
+    except Exception as error:
+        warnings.warn(f"ground truth is missing: {type(error).__name__}: {error}", stacklevel=2)
+        return {}, np.empty((0, 0))
+
+
+def evaluate(
+    task: Task, settings: TaskSettings, policy: Policy, episodes: int, streams: Streams
+) -> Evaluation:
+    """Fresh episodes of the noise-free policy, on their own streams."""
+    return roll_out(
+        task, settings, policy, [streams.generator("reset", i) for i in range(episodes)], None
+    )
+
+
+class Environment:
+    """The world as a learner meets it: it collects, and what it collects counts.
+
+    Collections are keyed by (iteration, call): repeating an iteration after an interruption finds
+    its episodes on disk, or, when a file is damaged, collects the very same ones again.
+    """
+
+    def __init__(self, task: Task, settings: TaskSettings, streams: Streams, folder: Path) -> None:
+        self.settings = settings
+        self.iteration = 0
+        self._task = task
+        self._streams = streams
+        self._folder = folder
+        self._ledger: list[dict[str, Any]] = []
+        self._kept: dict[tuple[int, int], Episodes] = {}
+        self._call = 0
+
+    @property
+    def episodes(self) -> int:
+        """Episodes collected so far: the x-axis of every curve."""
+        return sum(int(entry["episodes"]) for entry in self._ledger)
+
+    @property
+    def steps(self) -> int:
+        """Actions executed so far."""
+        return self.episodes * self.settings.horizon
+
+    def begin(self, iteration: int) -> None:
+        """Start, or start again, an iteration."""
+        self.iteration = iteration
+        self._call = 0
+
+    def collect(self, policy: Policy, episodes: int, *, noisy: bool = True) -> Episodes:
+        """Line 4 of Algorithm 1: run the policy for ``episodes`` episodes that count."""
+        key = (self.iteration, self._call)
+        self._call += 1
+        entry = next((e for e in self._ledger if (e["iteration"], e["call"]) == key), None)
+        if entry is None or (found := self._load(entry)) is None:
+            streams = self._streams.under(*key)
+            collected = roll_out(
+                self._task,
+                self.settings,
+                policy,
+                [streams.generator("reset", i) for i in range(episodes)],
+                streams.generator("noise") if noisy else None,
+            )
+            found = collected.episodes
+            if entry is None:
+                self._ledger.append(self._store(key, noisy, collected))
+        self._kept[key] = found
+        return found
+
+    def recent(self, batches: int) -> list[Episodes]:
+        """The collections of the last ``batches`` iterations, this one included, oldest first."""
+        first = self.iteration - batches
+        return [self._get(e) for e in self._ledger if first < e["iteration"] <= self.iteration]
+
+    def collected(self, iteration: int) -> list[Episodes]:
+        """The collections of one iteration, in the order of their calls."""
+        return [self._get(entry) for entry in self._ledger if entry["iteration"] == iteration]
+
+    def summary(self, iteration: int) -> dict[str, float]:
+        """Means over the noisy episodes of an iteration: return, final measures, clipped share."""
+        entries = [e for e in self._ledger if e["iteration"] == iteration and e["noisy"]]
+        weights = [entry["episodes"] for entry in entries]
+        names = entries[0]["summary"] if entries else {}
+        return {
+            name: float(np.average([e["summary"][name] for e in entries], weights=weights))
+            for name in names
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """The ledger: which files hold which episodes, with their hashes."""
+        return {"ledger": [dict(entry) for entry in self._ledger]}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Take up a ledger; the episodes are read when they are asked for."""
+        self._ledger = [dict(entry) for entry in state["ledger"]]
+        self._kept.clear()
+
+    def _get(self, entry: Mapping[str, Any]) -> Episodes:
+        key = (int(entry["iteration"]), int(entry["call"]))
+        if key not in self._kept:
+            found = self._load(entry)
+            if found is None:
+                raise FileNotFoundError(
+                    f"episodes {self._folder / entry['file']} are missing or damaged: restore the "
+                    "file, or start the cell anew with --redo"
+                )
+            self._kept[key] = found
+        return self._kept[key]
+
+    def _load(self, entry: Mapping[str, Any]) -> Episodes | None:
+        try:
+            data = (self._folder / entry["file"]).read_bytes()
+        except OSError:
+            return None
+        if hashlib.sha256(data).hexdigest() != entry["sha256"]:
+            return None
+        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+            return Episodes(**dict(arrays), window=self.settings.observation.window)
+
+    def _store(self, key: tuple[int, int], noisy: bool, collected: Evaluation) -> dict[str, Any]:
+        """Write the file whole or not at all, and describe it."""
+        episodes = collected.episodes
+        buffer = io.BytesIO()
+        np.savez_compressed(
+            buffer,
+            frames=episodes.frames,
+            actions=episodes.actions,
+            action_means=episodes.action_means,
+            costs=episodes.costs,
+        )
+        data = buffer.getvalue()
+        name = f"{key[0]:04d}-{key[1]}.npz"
+        self._folder.mkdir(parents=True, exist_ok=True)
+        beside = self._folder / f".{name}.{os.getpid()}"
+        with beside.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        beside.replace(self._folder / name)
+        clipped = np.abs(episodes.actions) >= self.settings.action.bound
+        return {
+            "iteration": key[0],
+            "call": key[1],
+            "noisy": noisy,
+            "episodes": len(episodes),
+            "file": name,
+            "sha256": hashlib.sha256(data).hexdigest(),
+            "summary": {
+                **{name: float(values.mean()) for name, values in collected.summary().items()},
+                "clipped": float(clipped.mean()),
+            },
+        }

@@ -1,0 +1,1 @@
+"""From a list of cells to finished ones: the matrix, the worker, the scheduler and its engines."""

@@ -1,0 +1,36 @@
+"""Judging a policy: fresh noise-free episodes that no learner sees (rules of evidence 1 and 2)."""
+
+from __future__ import annotations
+
+from solar_cli.envs import build_task
+from solar_cli.episodes import Evaluation, Policy, evaluate
+from solar_cli.settings import Cell
+from solar_cli.store.records import Metric
+from solar_cli.streams import Streams
+
+
+class Judge:
+    """Evaluates the policies of one cell, with a simulator and random streams of its own."""
+
+    def __init__(self, cell: Cell) -> None:
+        self._configuration = cell.configuration
+        self._streams = Streams(cell.seed).under("evaluation")
+        self._task = build_task(cell.configuration.task)
+
+    def evaluate(self, policy: Policy, iteration: int) -> Evaluation:
+        """The policy after ``iteration``; 0 is the initial one. The same call, the same numbers."""
+        return evaluate(
+            self._task,
+            self._configuration.task,
+            policy,
+            self._configuration.evaluation.episodes,
+            self._streams.under(iteration),
+        )
+
+
+def measured(evaluation: Evaluation) -> list[Metric]:
+    """Every measure's mean, with one value an episode."""
+    return [
+        Metric(name, float(values.mean()), "noise_free", values)
+        for name, values in evaluation.summary().items()
+    ]

@@ -1,0 +1,1 @@
+"""Exact mathematics on float64 tensors: no networks, no input or output."""

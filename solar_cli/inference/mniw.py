@@ -1,0 +1,262 @@
+"""The matrix-normal inverse-Wishart (MNIW) belief about a linear-Gaussian map y = F x + noise.
+
+    S ~ IW(Psi, nu),   F | S ~ MN(M, S (rows), V (columns)),   y | x, F, S ~ N(F x, S)
+
+It is conjugate: pairs (x, y) add their sufficient statistics to its natural parameters
+(A, B, C, nu) = (Psi + M V^-1 M^T, M V^-1, V^-1, nu). ``RegressionStatistics`` holds either.
+In SOLAR y is the next latent and x = [z; a], or [z; a; 1] for an affine map (Eq. 2-3, 5).
+
+Axes: N samples, d outputs (latent), p regressors. Leading axes (time steps, folds) are batch axes.
+Functions that sum over samples take them on the axis before the last; functions of one sample
+broadcast the batch axes of the belief against the leading axes of the samples, so a belief a time
+step (T ...) meets samples (N T ...) as they are. Everything is computed in float64: conversions
+between the two forms lose half of the digits. Matrices that are not positive definite raise
+``torch.linalg.LinAlgError``.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from solar_cli.inference import cholesky, inverse_wishart
+
+
+class RegressionStatistics(NamedTuple):
+    """Sums over pairs (x, y); equally the natural parameters (A, B, C, nu) of an MNIW."""
+
+    yy: Float[Tensor, "*batch d d"]
+    yx: Float[Tensor, "*batch d p"]
+    xx: Float[Tensor, "*batch p p"]
+    n: Float[Tensor, "*batch"]
+
+    def plus(self, other: RegressionStatistics) -> RegressionStatistics:
+        """The statistics of both sets of pairs; batch axes broadcast."""
+        return RegressionStatistics(*(a + b for a, b in zip(self, other, strict=True)))
+
+    def scaled(self, weight: float | Float[Tensor, "*batch"]) -> RegressionStatistics:
+        """Every pair counted ``weight`` times."""
+        w = torch.as_tensor(weight, dtype=self.n.dtype, device=self.n.device)
+        matrix = w[..., None, None]
+        return RegressionStatistics(
+            self.yy * matrix, self.yx * matrix, self.xx * matrix, self.n * w
+        )
+
+
+class MNIW(NamedTuple):
+    """Standard parameters: E[F] = M, E[S^-1] = nu Psi^-1; proper for nu > d - 1."""
+
+    Psi: Float[Tensor, "*batch d d"]
+    nu: Float[Tensor, "*batch"]
+    M: Float[Tensor, "*batch d p"]
+    V: Float[Tensor, "*batch p p"]
+
+
+class ExpectedStatistics(NamedTuple):
+    """Expectations of an MNIW that the ELBO needs."""
+
+    precision: Float[Tensor, "*batch d d"]  # E[S^-1]
+    precision_F: Float[Tensor, "*batch d p"]  # E[S^-1 F]  # noqa: N815
+    F_precision_F: Float[Tensor, "*batch p p"]  # E[F^T S^-1 F]
+    log_det_precision: Float[Tensor, "*batch"]  # E log|S^-1|
+
+
+def natural(q: MNIW) -> RegressionStatistics:
+    """Natural parameters of a belief."""
+    C = cholesky.inverse(q.V)
+    B = q.M @ C
+    return RegressionStatistics(q.Psi + B @ q.M.mT, B, C, q.nu)
+
+
+def standard(parameters: RegressionStatistics) -> MNIW:
+    """The belief with these natural parameters.
+
+    One Cholesky factor of [[C, B^T], [B, A]] gives Psi = A - B C^-1 B^T as a product of its lower
+    right block, so Psi stays positive definite where the subtraction would not.
+    """
+    A, B, C, nu = parameters
+    p = C.shape[-1]
+    joint = torch.cat([torch.cat([C, B.mT], -1), torch.cat([B, A], -1)], -2)
+    factor = torch.linalg.cholesky(joint)
+    L_xx, L_yx, L_yy = factor[..., :p, :p], factor[..., p:, :p], factor[..., p:, p:]
+    M = torch.linalg.solve_triangular(L_xx, L_yx, upper=False, left=False)
+    whitening = cholesky.inverse_factor(L_xx)
+    return MNIW(L_yy @ L_yy.mT, nu, M, whitening.mT @ whitening)
+
+
+def log_normaliser(q: MNIW) -> Float[Tensor, "*batch"]:
+    """log Z of the joint density of (F, S), with all constants."""
+    d, p = q.M.shape[-2:]
+    columns = (inverse_wishart.log_determinant(q.V) + p * math.log(2 * math.pi)) * (d / 2)
+    return inverse_wishart.log_normaliser(q.Psi, q.nu) + columns
+
+
+def kl_divergence(q: MNIW, p: MNIW) -> Float[Tensor, "*batch"]:
+    """KL(q || p) in nats: the global KL term of the ELBO, a value for each time step."""
+    d, regressors = q.M.shape[-2:]
+    V_p = torch.linalg.cholesky(p.V)
+    difference = torch.linalg.solve_triangular(V_p.mT, q.M - p.M, upper=True, left=False)
+    mean_shift: Tensor = q.nu * (difference * torch.linalg.solve(q.Psi, difference)).sum((-2, -1))
+    trace = torch.cholesky_solve(q.V, V_p).diagonal(dim1=-2, dim2=-1).sum(-1)
+    log_ratio = inverse_wishart.log_determinant(p.V) - inverse_wishart.log_determinant(q.V)
+    conditional = ((trace - regressors + log_ratio) * d + mean_shift) / 2
+    return inverse_wishart.kl_divergence(q.Psi, q.nu, p.Psi, p.nu) + conditional
+
+
+def expected_statistics(q: MNIW) -> ExpectedStatistics:
+    """E_q of the precision, of its products with F, and of its log-determinant."""
+    d = q.Psi.shape[-1]
+    precision = q.nu[..., None, None] * cholesky.inverse(q.Psi)
+    precision_F = precision @ q.M
+    return ExpectedStatistics(
+        precision=precision,
+        precision_F=precision_F,
+        F_precision_F=q.M.mT @ precision_F + d * q.V,
+        log_det_precision=inverse_wishart.expected_log_det_precision(q.Psi, q.nu),
+    )
+
+
+def regression_statistics(
+    x: Float[Tensor, "*batch N p"],
+    y: Float[Tensor, "*batch N d"],
+    x_variance: Float[Tensor, "*batch N p"] | None = None,
+    y_variance: Float[Tensor, "*batch N d"] | None = None,
+    weights: Float[Tensor, "*batch N"] | None = None,
+) -> RegressionStatistics:
+    """Expected sufficient statistics of N pairs, summed over the sample axis.
+
+    The variances are the diagonals of a mean-field q (Eq. 5), under which x and y are independent;
+    ``weights`` counts pairs (0 masks one out).
+    """
+    x, y = x.double(), y.double()
+    w = torch.ones_like(x[..., 0]) if weights is None else weights.double()
+    x_weighted, y_weighted = w[..., None] * x, w[..., None] * y
+    yy, yx, xx = y_weighted.mT @ y, y_weighted.mT @ x, x_weighted.mT @ x
+    if x_variance is not None:
+        xx = xx + torch.diag_embed((w[..., None] * x_variance.double()).sum(-2))
+    if y_variance is not None:
+        yy = yy + torch.diag_embed((w[..., None] * y_variance.double()).sum(-2))
+    return RegressionStatistics(yy, yx, xx, w.sum(-1).expand(xx.shape[:-2]))
+
+
+def expected_transition_kl(
+    expected: ExpectedStatistics,
+    y_mean: Float[Tensor, "*#sample d"],
+    y_variance: Float[Tensor, "*#sample d"],
+    x_mean: Float[Tensor, "*#sample p"],
+    x_variance: Float[Tensor, "*#sample p"],
+) -> Float[Tensor, "*sample"]:
+    """E_q(F,S) E_q(x) KL(N(y_mean, diag y_variance) || N(F x, S)) in nats, for each sample.
+
+    The latent KL term of the ELBO (section 3), with the uncertainty of F, S and x in it;
+    differentiable in means and variances. An exactly known regressor (a constant) has variance 0.
+    """
+    y_mean, y_variance = y_mean.double(), y_variance.double()
+    x_mean, x_variance = x_mean.double(), x_variance.double()
+    precision, precision_F, F_precision_F, log_det_precision = expected
+    quadratic = (
+        _form(precision, y_mean, y_mean)
+        - 2 * _form(precision_F, y_mean, x_mean)
+        + _form(F_precision_F, x_mean, x_mean)
+    )
+    spread = (precision.diagonal(dim1=-2, dim2=-1) * y_variance).sum(-1) + (
+        F_precision_F.diagonal(dim1=-2, dim2=-1) * x_variance
+    ).sum(-1)
+    log_ratio = log_det_precision + y_variance.log().sum(-1)
+    return (quadratic + spread - log_ratio - y_mean.shape[-1]) / 2
+
+
+def natural_gradient_step(
+    current: RegressionStatistics,
+    prior: RegressionStatistics,
+    batch_statistics: RegressionStatistics,
+    scale: float,
+    rate: float,
+) -> RegressionStatistics:
+    """lambda + rate (lambda_0 + scale E_q[t(batch)] - lambda), on natural parameters.
+
+    Eq. 6 prints the statistics of (F, S) where the expected statistics of the *data* belong.
+    ``scale`` is the data's size over the batch's, so at rate 1 on all data (scale 1) the step is
+    the closed form, the conjugate posterior.
+    """
+    target = prior.plus(batch_statistics.scaled(scale))
+    return current.scaled(1 - rate).plus(target.scaled(rate))
+
+
+def posterior(prior: MNIW, statistics: RegressionStatistics) -> MNIW:
+    """The belief after the data: Bayesian linear regression.
+
+    Appendix B, with nu_t = nu' + N and V_t = (V'^-1 + sum x x^T)^-1, which it misprints.
+    """
+    return standard(natural(prior).plus(statistics))
+
+
+def point_estimate(q: MNIW) -> tuple[Float[Tensor, "*batch d p"], Float[Tensor, "*batch d d"]]:
+    """F = M and Sigma = Psi / nu of section 4.1, which is (E[S^-1])^-1 and not the mode."""
+    return q.M, q.Psi / q.nu[..., None, None]
+
+
+def centred(statistics: RegressionStatistics, constant: int) -> RegressionStatistics:
+    """The statistics without the constant-1 regressor at index ``constant``.
+
+    Its intercept is integrated out under a flat prior (a Schur complement, and one sample less), so
+    that the slopes of several time steps can be pooled while each keeps its own means. A time
+    step without data stays empty.
+    """
+    yy, yx, xx, n = statistics
+    constant = constant % xx.shape[-1]
+    keep = [i for i in range(xx.shape[-1]) if i != constant]
+    count = xx[..., constant, constant, None, None]
+    count = torch.where(count > 0, count, 1.0)
+    x_sum, y_sum = xx[..., keep, constant, None], yx[..., constant, None]
+    return RegressionStatistics(
+        yy - y_sum @ y_sum.mT / count,
+        yx[..., keep] - y_sum @ x_sum.mT / count,
+        xx[..., keep, :][..., keep] - x_sum @ x_sum.mT / count,
+        (n - 1).clamp(min=0),
+    )
+
+
+def log_evidence(prior: MNIW, statistics: RegressionStatistics) -> Float[Tensor, "*batch"]:
+    """log p(Y | X) of the pairs behind ``statistics`` with F and S integrated out, in nats."""
+    after, d = posterior(prior, statistics), prior.M.shape[-2]
+    constant = statistics.n * d / 2 * math.log(2 * math.pi)
+    return log_normaliser(after) - log_normaliser(prior) - constant
+
+
+def predictive_log_likelihood(
+    q: MNIW, x: Float[Tensor, "*#sample p"], y: Float[Tensor, "*#sample d"]
+) -> Float[Tensor, "*sample"]:
+    """log p(y | x) with F and S integrated out, in nats, for each sample by itself.
+
+    A multivariate Student t with nu - d + 1 degrees of freedom, location M x and scale matrix
+    Psi (1 + x^T V x) / (nu - d + 1).
+    """
+    x, y = x.double(), y.double()
+    d = q.Psi.shape[-1]
+    factor = torch.linalg.cholesky(q.Psi)
+    residual = y - torch.einsum("...ij,...j->...i", q.M, x)
+    squared = (
+        torch.einsum("...ij,...j->...i", cholesky.inverse_factor(factor), residual).square().sum(-1)
+    )
+    inflation = 1 + _form(q.V, x, x)
+    log_det = cholesky.log_determinant(factor) + d * inflation.log()
+    return (
+        torch.lgamma((q.nu + 1) / 2)
+        - torch.lgamma((q.nu - d + 1) / 2)
+        - 0.5 * (d * math.log(math.pi) + log_det)
+        - (q.nu + 1) / 2 * torch.log1p(squared / inflation)
+    )
+
+
+def _form(
+    matrix: Float[Tensor, "*#sample i j"],
+    left: Float[Tensor, "*#sample i"],
+    right: Float[Tensor, "*#sample j"],
+) -> Float[Tensor, "*sample"]:
+    """left^T A right; the matrix is not copied along axes on which it broadcasts."""
+    return (left * torch.einsum("...ij,...j->...i", matrix, right)).sum(-1)

@@ -1,0 +1,88 @@
+"""The normal-inverse-Wishart (NIW) belief about the Gaussian of the initial latent state (Eq. 2-3).
+
+    Sigma ~ IW(Psi, nu),   mu | Sigma ~ N(mu0, Sigma / kappa),   z_0 ~ N(mu, Sigma)
+
+It is the MNIW of a regression on the constant 1 alone: M = mu0, V = 1/kappa. So its natural
+parameters are the same ``RegressionStatistics`` with p = 1, and move by the same
+``natural_gradient_step``.
+
+Axes: N samples, d latent. Leading axes are batch axes; float64 throughout.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from solar_cli.inference import mniw
+from solar_cli.inference.mniw import MNIW, RegressionStatistics
+from solar_cli.inference.mniw import natural_gradient_step as natural_gradient_step
+
+
+class NIW(NamedTuple):
+    """Standard parameters; proper for nu > d - 1 and kappa > 0."""
+
+    Psi: Float[Tensor, "*batch d d"]
+    nu: Float[Tensor, "*batch"]
+    mu0: Float[Tensor, "*batch d"]
+    kappa: Float[Tensor, "*batch"]
+
+
+def natural(q: NIW) -> RegressionStatistics:
+    """Natural parameters (Psi + kappa mu0 mu0^T, kappa mu0, kappa, nu)."""
+    return mniw.natural(_as_regression(q))
+
+
+def standard(parameters: RegressionStatistics) -> NIW:
+    """The belief with these natural parameters."""
+    q = mniw.standard(parameters)
+    return NIW(q.Psi, q.nu, q.M[..., 0], 1 / q.V[..., 0, 0])
+
+
+def log_normaliser(q: NIW) -> Float[Tensor, "*batch"]:
+    """log Z of the joint density of (mu, Sigma), with all constants."""
+    return mniw.log_normaliser(_as_regression(q))
+
+
+def kl_divergence(q: NIW, p: NIW) -> Float[Tensor, "*batch"]:
+    """KL(q || p) in nats."""
+    return mniw.kl_divergence(_as_regression(q), _as_regression(p))
+
+
+def initial_statistics(
+    z_mean: Float[Tensor, "*batch N d"],
+    z_variance: Float[Tensor, "*batch N d"] | None = None,
+    weights: Float[Tensor, "*batch N"] | None = None,
+) -> RegressionStatistics:
+    """Expected sufficient statistics of N initial states under a mean-field q, summed over them."""
+    ones = torch.ones_like(z_mean[..., :1])
+    return mniw.regression_statistics(ones, z_mean, y_variance=z_variance, weights=weights)
+
+
+def expected_initial_kl(
+    q: NIW, z_mean: Float[Tensor, "*#sample d"], z_variance: Float[Tensor, "*#sample d"]
+) -> Float[Tensor, "*sample"]:
+    """E_q(mu,Sigma) KL(N(z_mean, diag z_variance) || N(mu, Sigma)) in nats, for each sample.
+
+    The t = 0 term of the latent KL, which the paper's ELBO leaves out; differentiable in both.
+    """
+    one = torch.ones_like(z_mean[..., :1])
+    expected = mniw.expected_statistics(_as_regression(q))
+    return mniw.expected_transition_kl(expected, z_mean, z_variance, one, torch.zeros_like(one))
+
+
+def posterior(prior: NIW, statistics: RegressionStatistics) -> NIW:
+    """The belief after the initial states behind ``statistics``."""
+    return standard(natural(prior).plus(statistics))
+
+
+def point_estimate(q: NIW) -> tuple[Float[Tensor, "*batch d"], Float[Tensor, "*batch d d"]]:
+    """mu0 and Psi / nu, as for the dynamics (section 4.1)."""
+    return q.mu0, q.Psi / q.nu[..., None, None]
+
+
+def _as_regression(q: NIW) -> MNIW:
+    return MNIW(q.Psi, q.nu, q.mu0[..., None], 1 / q.kappa[..., None, None])

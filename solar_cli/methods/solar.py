@@ -1,0 +1,47 @@
+"""SOLAR, Algorithm 1: latents with a Bayesian linear dynamical system as their prior.
+
+What is learned: the recognition and observation networks, the variational factors over latent
+dynamics, and a time-varying linear-Gaussian policy on latents. Ablations plug another prior or
+another model into the same page.
+"""
+
+from __future__ import annotations
+
+from solar_cli.control.local_dynamics import infer_dynamics
+from solar_cli.control.lqr import improve_policy
+from solar_cli.episodes import Environment
+from solar_cli.methods.local import LocalLearner
+from solar_cli.models.priors import LinearDynamics, Prior
+from solar_cli.settings.local import Solar as SolarSettings
+
+
+class Solar(LocalLearner):
+    """SOLAR on one cell."""
+
+    def make_prior(self) -> Prior:
+        """The prior over latents that the representation is trained with (Eq. 2 and 3)."""
+        assert isinstance(self.settings, SolarSettings)
+        return LinearDynamics(self.settings.dynamics, self.latent, self.task, self.device)
+
+    def iterate(self, environment: Environment) -> dict[str, float]:
+        """One turn of Algorithm 1 (lines 4 to 8)."""
+        tried = self.collect(environment)  # line 4: N rollouts of the current policy
+        region = self.trust_region.judged(tried, self.settings.update.reject)
+        episodes, older = self.batches(environment, region)
+
+        fit = self.representation.update(environment)  # line 5: MODELUPDATE, section 3
+        states, older_states = self.embedded(episodes), [self.embedded(batch) for batch in older]
+
+        previous = self.linearised(region, states)  # line 6: LINEARIZEPOLICY, appendix C
+        dynamics = infer_dynamics(  # line 7: INFERDYNAMICS, section 4.1 and appendix B
+            states,
+            older_states,
+            self.representation.dynamics_prior,
+            self.settings.local_fit,
+            self.streams.under("local dynamics", environment.iteration),
+        )
+        cost = self.fitted_cost(states)  # the quadratic cost of section 3
+        update = improve_policy(  # line 8: POLICYUPDATE, section 4.2 and appendix A
+            previous.policy, dynamics.model, cost.model, self.max_kl(region), self.std_bounds
+        )
+        return self.adopted(region, fit, previous, dynamics, cost, update)

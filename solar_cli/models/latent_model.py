@@ -1,0 +1,83 @@
+"""The latent variable model of section 3: frame networks, a prior over latents, and their ELBO."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from solar_cli.episodes import Episodes
+from solar_cli.models.frames import FrameModel
+from solar_cli.models.priors import Prior, Segments, standard_normal_kl
+
+CHUNK = 512  # frames encoded at once: bounds memory, loses no speed
+
+
+class Minibatch(NamedTuple):
+    """Segments of consecutive frames, and what is random about a step."""
+
+    frames: Tensor
+    """(S, L, *frame) as stored"""
+    actions: Float[Tensor, "S L_1 a"]
+    start: Tensor
+    """(S,) time step of the first frame"""
+    noise: Float[Tensor, "S L d"]
+    """standard normal draws for the sample of q(z | s)"""
+    decoded: Tensor
+    """numbers of the frames, of S L, that are decoded"""
+
+
+class LatentModel:
+    """q(z | s), p(s | z) and the prior over z; ``networks`` holds what Adam trains."""
+
+    def __init__(self, networks: FrameModel, prior: Prior, standard_normal: float) -> None:
+        self.networks = networks
+        self.prior = prior
+        self.standard_normal = standard_normal
+
+    def loss(
+        self, batch: Minibatch, kl_weight: float
+    ) -> tuple[Tensor, Segments, dict[str, Tensor]]:
+        """The negative ELBO in nats a frame, the factors q(z | s), and the ELBO's terms."""
+        scaled = self.networks.scaled(batch.frames.flatten(0, 1))
+        mean, variance = self.networks.encode(scaled)
+        sample = mean + variance.sqrt() * batch.noise.flatten(0, 1)
+        reconstruction = self.networks.reconstruction_loss(
+            sample[batch.decoded], scaled[batch.decoded]
+        )
+        shape = (*batch.frames.shape[:2], -1)
+        segments = Segments(
+            mean.view(shape).double(), variance.view(shape).double(), batch.actions, batch.start
+        )
+        kl = self.prior.kl(segments)
+        total_kl = kl
+        if self.standard_normal:
+            spread = standard_normal_kl(segments.mean, segments.variance).mean()
+            total_kl = kl + self.standard_normal * spread
+        loss = reconstruction + kl_weight * total_kl
+        return loss, segments, {"elbo_reconstruction": -reconstruction, "elbo_kl": kl}
+
+    @torch.no_grad()
+    def embed(self, frames: Tensor) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d"]]:
+        """Mean and variance of q(z | s), float64, for frames as stored; each frame once."""
+        parts = [
+            self.networks.encode(self.networks.scaled(chunk))
+            for chunk in torch.split(frames, CHUNK)
+        ]
+        mean, variance = (torch.cat(part).double() for part in zip(*parts, strict=True))
+        return mean, variance
+
+    def posterior(self, episodes: Episodes, device: str) -> Segments:
+        """q(z | s) of whole episodes, each as one segment."""
+        frames = torch.from_numpy(np.ascontiguousarray(episodes.frames)).to(device)
+        mean, variance = self.embed(frames.flatten(0, 1))
+        shape = (*frames.shape[:2], -1)
+        return Segments(
+            mean.view(shape),
+            variance.view(shape),
+            torch.from_numpy(episodes.actions).to(device),
+            torch.zeros(len(episodes), dtype=torch.long, device=device),
+        )

@@ -1,0 +1,115 @@
+"""Torch modules from a card's layer list (`solar_cli.settings.networks`)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from solar_cli.errors import UsageError
+from solar_cli.settings.networks import (
+    Conv,
+    Deconv,
+    Layer,
+    Linear,
+    SpatialSoftmax,
+    Unshuffle,
+)
+
+Shape = tuple[int, ...]
+
+
+class SpatialSoftmaxLayer(nn.Module):
+    """Expected coordinates (x, y) in [-1, 1] of each channel under a softmax over its pixels.
+
+    Finn et al. 2016, deep spatial auto-encoders, with a learned inverse temperature.
+    """
+
+    columns: Tensor
+    rows: Tensor
+
+    def __init__(self, height: int, width: int, log_temperature: float) -> None:
+        super().__init__()
+        self.log_temperature = nn.Parameter(torch.tensor(log_temperature))
+        self.register_buffer("columns", torch.linspace(-1, 1, width), persistent=False)
+        self.register_buffer("rows", torch.linspace(1, -1, height), persistent=False)
+
+    def forward(self, maps: Float[Tensor, "n c h w"]) -> Float[Tensor, "n two_c"]:
+        """Coordinates of all channels: x of each, then y of each (up is positive)."""
+        share = (maps.flatten(2) * self.log_temperature.exp()).softmax(dim=-1).view_as(maps)
+        x = (share.sum(dim=2) * self.columns).sum(dim=-1)
+        y = (share.sum(dim=3) * self.rows).sum(dim=-1)
+        return torch.cat([x, y], dim=-1)
+
+
+def build(layers: Sequence[Layer], shape: Shape) -> tuple[nn.Sequential, Shape]:
+    """The network and its output shape for inputs of ``shape`` (without the batch axis).
+
+    Raises `UsageError` where a layer does not fit what comes before it.
+    """
+    modules: list[nn.Module] = []
+    for number, layer in enumerate(layers, 1):
+        try:
+            added, shape = _layer(layer, shape)
+        except (ValueError, ZeroDivisionError) as error:
+            raise UsageError(
+                f"layer {number} ({layer.kind}) does not fit an input of shape {shape}: {error}; "
+                "correct the card's layer list"
+            ) from error
+        modules += added
+    return nn.Sequential(*modules), shape
+
+
+def _layer(layer: Layer, shape: Shape) -> tuple[list[nn.Module], Shape]:
+    if isinstance(layer, Linear):
+        width = math.prod(shape)
+        flatten = [nn.Flatten()] if len(shape) > 1 else []
+        linear = nn.Linear(width, layer.width)
+        return [*flatten, linear, *_activation(layer.activation)], (layer.width,)
+    if isinstance(layer, Deconv) and len(shape) == 1:
+        shape = (shape[0], 1, 1)
+        added, shape = _image_layer(layer, shape)
+        return [nn.Unflatten(1, (-1, 1, 1)), *added], shape
+    if len(shape) != 3:
+        raise ValueError("it needs an image (C, H, W)")
+    return _image_layer(layer, shape)
+
+
+def _image_layer(layer: Layer, shape: Shape) -> tuple[list[nn.Module], Shape]:
+    channels, height, width = shape
+    if isinstance(layer, Unshuffle):
+        factor = layer.factor
+        if height % factor or width % factor:
+            raise ValueError(f"sides are no multiples of {factor}")
+        return [nn.PixelUnshuffle(factor)], (
+            channels * factor**2,
+            height // factor,
+            width // factor,
+        )
+    if isinstance(layer, SpatialSoftmax):
+        return [SpatialSoftmaxLayer(height, width, layer.log_temperature)], (2 * channels,)
+    if isinstance(layer, Deconv):
+        deconv = nn.ConvTranspose2d(channels, layer.channels, layer.size, layer.stride)
+        sides = [(side - 1) * layer.stride + layer.size for side in (height, width)]
+        return [deconv, *_activation(layer.activation)], (layer.channels, *sides)
+    assert isinstance(layer, Conv)
+    if channels % layer.groups or layer.channels % layer.groups:
+        raise ValueError(f"channels are no multiples of {layer.groups} groups")
+    sides = [
+        ((side + 2 * layer.padding - layer.size) // layer.stride + 1) // layer.pool
+        for side in (height, width)
+    ]
+    if min(sides) < 1:
+        raise ValueError("nothing is left of the image")
+    conv = nn.Conv2d(
+        channels, layer.channels, layer.size, layer.stride, layer.padding, groups=layer.groups
+    )
+    pool = [nn.MaxPool2d(layer.pool)] if layer.pool > 1 else []
+    return [conv, *_activation(layer.activation), *pool], (layer.channels, *sides)
+
+
+def _activation(name: str) -> list[nn.Module]:
+    return [nn.ReLU()] if name == "relu" else []

@@ -1,0 +1,181 @@
+"""The one training loop: stochastic gradients for networks, natural gradients for the prior.
+
+It can stop after any step and go on with the same bits: what a step draws is keyed by its number,
+and `Trainer.state_dict` holds the rest.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from solar_cli.episodes import Episodes
+from solar_cli.models.latent_model import LatentModel, Minibatch
+from solar_cli.pulse import Diverged, Pulse
+from solar_cli.settings.local import Training
+from solar_cli.streams import Streams
+
+PULSE_STEPS = 20
+SMOOTHING = 0.98  # of the ELBO terms that are reported: an average over about 50 steps
+
+
+class Trainer:
+    """Runs `LatentModel.loss` for a number of steps on batches of episodes."""
+
+    def __init__(self, settings: Training, streams: Streams, device: str, pulse: Pulse) -> None:
+        self.settings = settings
+        self.streams = streams
+        self.device = device
+        self.pulse = pulse
+        self._running: dict[str, Any] | None = None
+        self._optimiser: torch.optim.Adam | None = None
+
+    def fit(
+        self,
+        name: str,
+        model: LatentModel,
+        batches: list[Episodes],
+        steps: int,
+        *,
+        fine_tuning: bool = False,
+    ) -> dict[str, float]:
+        """Train for ``steps`` steps, then condition the prior on all data; smoothed ELBO terms.
+
+        ``name`` keys the run's random draws; a run of that name that was interrupted goes on.
+        When fine-tuning, half of the segments come from the newest batch.
+        """
+        data = Dataset(batches, self.device)
+        networks = model.networks
+        optimiser = torch.optim.Adam(
+            networks.parameters(), lr=self.settings.learning_rate, fused=True
+        )
+        if self._running is None or self._running["name"] != name:
+            self._running = {"name": name, "step": 0, "terms": {}}
+        elif "optimiser" in self._running:
+            optimiser.load_state_dict(self._running.pop("optimiser"))
+        self._optimiser = optimiser
+        running = self._running
+        while running["step"] < steps:
+            step = int(running["step"])
+            share = step / steps
+            for group in optimiser.param_groups:
+                group["lr"] = self._rate(share, fine_tuning)
+            batch = data.minibatch(
+                self.settings,
+                self.streams.generator("minibatch", name, step),
+                networks.settings.latent,
+                fine_tuning,
+            )
+            weight = self.settings.kl_end if fine_tuning else self._kl_weight(share)
+            loss, segments, terms = model.loss(batch, weight)
+            optimiser.zero_grad()
+            torch.autograd.backward(loss)
+            torch.nn.utils.clip_grad_norm_(networks.parameters(), self.settings.clip)
+            optimiser.step()
+            model.prior.learn(
+                type(segments)(*(part.detach() for part in segments)), data.weights(batch)
+            )
+            running["step"] = step + 1
+            self._smooth(running["terms"], terms)
+            if (step + 1) % PULSE_STEPS == 0:
+                if not math.isfinite(float(loss.detach())):
+                    raise Diverged(f"the model's loss is not finite at step {step + 1} of {name}")
+                self.pulse(f"training the model ({name})", (step + 1) / steps)
+        self._running = self._optimiser = None
+        model.prior.condition(data.posterior(model))
+        return {name: float(value) for name, value in running["terms"].items()}
+
+    def _rate(self, share: float, fine_tuning: bool) -> float:
+        if fine_tuning:
+            return self.settings.fine_tune_rate
+        if self.settings.schedule == "constant":
+            return self.settings.learning_rate
+        return self.settings.learning_rate * 0.5 * (1 + math.cos(math.pi * share))
+
+    def _kl_weight(self, share: float) -> float:
+        """Held at first, then a linear rise: a KL term from the start collapses the latents."""
+        settings = self.settings
+        rise = (share - settings.kl_hold) / settings.kl_ramp if settings.kl_ramp else math.inf
+        rise = min(max(rise, 0.0), 1.0) if share >= settings.kl_hold else 0.0
+        return settings.kl_start + rise * (settings.kl_end - settings.kl_start)
+
+    @staticmethod
+    def _smooth(terms: dict[str, float], new: dict[str, Tensor]) -> None:
+        for name, value in new.items():
+            # Kept as tensors: reading a number would wait for the device at every step.
+            value = value.detach().double()
+            old = terms.get(name)
+            terms[name] = value if old is None else SMOOTHING * old + (1 - SMOOTHING) * value  # type: ignore[assignment]
+
+    @property
+    def under_way(self) -> bool:
+        """Whether a run was interrupted that the next ``fit`` of its name takes up."""
+        return self._running is not None
+
+    def state_dict(self) -> dict[str, Any]:
+        """A run that is under way: its step, smoothed terms and optimiser."""
+        if self._running is None:
+            return {}
+        optimiser = self._optimiser
+        state = {**self._running, "terms": dict(self._running["terms"])}
+        return state if optimiser is None else {**state, "optimiser": optimiser.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take up a run that was under way; it goes on when ``fit`` is called with its name."""
+        self._running = dict(state) or None
+        self._optimiser = None
+
+
+class Dataset:
+    """Batches of episodes on the device, and minibatches of segments from them."""
+
+    def __init__(self, batches: list[Episodes], device: str) -> None:
+        self.device = device
+        self.episodes = Episodes.joined(batches)
+        self.newest = len(batches[-1])
+        self.frames = torch.from_numpy(self.episodes.frames).to(device)
+        self.actions = torch.from_numpy(self.episodes.actions).to(device)
+
+    def minibatch(
+        self, settings: Training, stream: np.random.Generator, latent: int, favour_newest: bool
+    ) -> Minibatch:
+        """Random segments; with ``favour_newest`` half of them from the newest batch."""
+        count, frames = len(self.episodes), self.episodes.horizon + 1
+        length = min(settings.length, frames)
+        segments = settings.segments
+        rows = stream.integers(count, size=segments)
+        if favour_newest:
+            half = segments // 2
+            rows[:half] = count - 1 - stream.integers(self.newest, size=half)
+        starts = stream.integers(frames - length + 1, size=segments)
+        noise = stream.standard_normal((segments, length, latent), dtype=np.float32)
+        decoded = stream.permutation(segments * length)
+        decoded = decoded[: max(1, round(settings.decoded * segments * length))]
+        row = torch.from_numpy(rows).to(self.device)[:, None]
+        start = torch.from_numpy(starts).to(self.device)
+        times = start[:, None] + torch.arange(length, device=self.device)
+        return Minibatch(
+            self.frames[row, times],
+            self.actions[row, times[:, :-1]],
+            start,
+            torch.from_numpy(noise).to(self.device),
+            torch.from_numpy(decoded).to(self.device),
+        )
+
+    def weights(self, batch: Minibatch) -> tuple[float, float]:
+        """B of Eq. 6: how many times a minibatch goes into the data, by transitions and by starts.
+
+        A segment starts an episode with probability 1 / (T - L + 2).
+        """
+        segments, length = batch.frames.shape[:2]
+        count, horizon = len(self.episodes), self.episodes.horizon
+        transitions = count * horizon / (segments * (length - 1))
+        return transitions, count * (horizon - length + 2) / segments
+
+    def posterior(self, model: LatentModel) -> Any:
+        """q(z | s) of every episode."""
+        return model.posterior(self.episodes, self.device)

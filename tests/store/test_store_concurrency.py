@@ -1,0 +1,151 @@
+"""Several processes at one SQLite file: nothing fails, nothing is lost, nothing is seen half."""
+
+import multiprocessing
+import sqlite3
+from collections import Counter
+from collections.abc import Callable
+from multiprocessing.synchronize import Barrier
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from solar_cli.settings import Cell, cells, load_card
+from solar_cli.store.owner import Owner
+from solar_cli.store.records import CellBusy, Metric
+from solar_cli.store.store import Store
+
+# Processes of their own, not forks of this one, which may hold threads and connections.
+processes = multiprocessing.get_context("forkserver")
+processes.set_forkserver_preload(["solar_cli.store.store", "alembic.command"])
+WRITERS, ITERATIONS, METRICS = 8, 12, 10
+
+
+def nav(seed: int) -> Cell:
+    return cells(load_card("nav"), "solar", [seed])[0]
+
+
+def together(work: Callable[..., Any], *arguments: tuple[Any, ...]) -> list[Any]:
+    """Run one process for each tuple of arguments, all starting at once; their answers."""
+    barrier = processes.Barrier(len(arguments))
+    answers = processes.SimpleQueue()
+    started = [
+        processes.Process(target=_answer, args=(work, answers, barrier, *each))
+        for each in arguments
+    ]
+    for process in started:
+        process.start()
+    found = [answers.get() for _ in started]
+    for process in started:
+        process.join()
+    return found
+
+
+def _answer(work: Callable[..., Any], answers: Any, barrier: Barrier, *arguments: Any) -> None:
+    try:
+        answers.put(work(barrier, *arguments))
+    except BaseException as error:
+        answers.put(f"{type(error).__name__}: {error}")
+
+
+def write(barrier: Barrier, address: str, seed: int) -> int:
+    """Compute a cell: a heartbeat and a commit an iteration."""
+    cell = nav(seed)
+    with Store.open(address) as store:
+        barrier.wait()
+        store.add([cell])
+        attempt = store.claim(cell.hash, Owner.current(), 1, {})
+        for iteration in range(ITERATIONS):
+            store.beat(cell.hash, attempt, "writing", iteration / ITERATIONS)
+            store.commit(
+                cell.hash,
+                attempt,
+                iteration=iteration,
+                episodes=iteration,
+                steps=0,
+                simulated_seconds=0.0,
+                seconds=0.0,
+                metrics=[Metric(f"m{i}", float(seed)) for i in range(METRICS)],
+            )
+    return 0
+
+
+def read(barrier: Barrier, address: str) -> int:
+    """Read until all is there; the number of iterations that were ever seen in part."""
+    torn = 0
+    with Store.open(address, read_only=True) as store:
+        barrier.wait()
+        while True:
+            rows = Counter((row["cell"], row["iteration"]) for row in store.metrics())
+            torn += sum(count != METRICS for count in rows.values())
+            if len(rows) == WRITERS * ITERATIONS:
+                return torn
+
+
+def test_eight_writers_and_a_reader_lose_nothing_and_see_no_half_iteration(tmp_path: Path) -> None:
+    address = str(tmp_path / "solar.db")
+    Store.open(address).close()
+
+    assert together(_turn, *((address, seed) for seed in range(WRITERS + 1))) == [0] * (WRITERS + 1)
+
+    with Store.open(address) as store:
+        rows = store.metrics()
+        assert len(rows) == WRITERS * ITERATIONS * METRICS
+        assert all(row["value"] == row["seed"] for row in rows)
+        assert [r.iteration for r in store.cells()] == [ITERATIONS - 1] * WRITERS
+        assert store.diagnose()["integrity"] == "ok"
+
+
+def _turn(barrier: Barrier, address: str, seed: int) -> int:
+    """Eight write and the ninth reads."""
+    return write(barrier, address, seed) if seed < WRITERS else read(barrier, address)
+
+
+def claim(barrier: Barrier, address: str) -> str:
+    with Store.open(address) as store:
+        barrier.wait()
+        try:
+            store.claim(nav(0).hash, Owner.current(), 1, {})
+        except CellBusy:
+            answer = "busy"
+        else:
+            answer = "mine"
+        barrier.wait()  # live until all have asked
+        return answer
+
+
+def test_of_many_claims_at_once_one_gets_the_cell(tmp_path: Path) -> None:
+    address = str(tmp_path / "solar.db")
+    with Store.open(address) as store:
+        store.add([nav(0)])
+    assert sorted(together(claim, *[(address,)] * 4)) == ["busy"] * 3 + ["mine"]
+
+
+def create(barrier: Barrier, address: str, seed: int) -> str:
+    barrier.wait()
+    with Store.open(address) as store:
+        store.add([nav(seed)])
+    return "opened"
+
+
+def test_of_many_that_open_an_empty_path_one_creates_and_all_go_on(tmp_path: Path) -> None:
+    address = str(tmp_path / "new" / "folder" / "solar.db")
+    assert together(create, *((address, seed) for seed in range(4))) == ["opened"] * 4
+    with Store.open(address, read_only=True) as store:
+        assert [record.cell.seed for record in store.cells()] == [0, 1, 2, 3]
+    with sqlite3.connect(address) as connection:
+        assert len(connection.execute("SELECT * FROM alembic_version").fetchall()) == 1
+
+
+def test_of_many_that_open_an_empty_server_one_creates_and_all_go_on(
+    postgresql: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    address = postgresql.replace("/postgres?", "/created?")
+    with Store.open(postgresql) as store:
+        engine = store._database._engine.execution_options(isolation_level="AUTOCOMMIT")
+        with engine.connect() as connection:
+            connection.exec_driver_sql("DROP DATABASE IF EXISTS created WITH (FORCE)")
+            connection.exec_driver_sql("CREATE DATABASE created")
+    assert together(create, *((address, seed) for seed in range(4))) == ["opened"] * 4
+    with Store.open(address, read_only=True) as store:
+        assert [record.cell.seed for record in store.cells()] == [0, 1, 2, 3]
