@@ -61,11 +61,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return INTERRUPTED
     except BrokenPipeError:
-        return _reader_left()
+        silence_output()
+        return 1
     return code if isinstance(code, int) else 0
 
 
-def _reader_left() -> int:
+def silence_output() -> None:
     """Whoever read our output, such as ``head``, has seen enough: say nothing more."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return 1

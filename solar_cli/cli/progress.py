@@ -13,19 +13,19 @@ if TYPE_CHECKING:
 
     from solar_cli.experiment.scheduler import Event
 
-COLUMNS = ("running", "iteration>", "episodes>", "headline measure>", "doing", "time left>")
+COLUMNS = ("cell", "iteration>", "episodes>", "headline measure>", "doing", "time left>")
 Report = Callable[["Event"], None]
 
 
 @contextmanager
-def watching(json: bool) -> Iterator[Report]:
-    """What the scheduler reports its events to, as long as the matrix runs."""
+def watching(json: bool, cells: int) -> Iterator[Report]:
+    """What the scheduler reports its events to, as long as it computes that many cells."""
     if json:
         yield Lines(json_line)
     elif console().is_terminal:
         from rich.live import Live
 
-        board = Board()
+        board = Board(cells)
         with Live(get_renderable=board.table, console=console(), transient=True) as live:
 
             def report(event: Event) -> None:
@@ -38,23 +38,28 @@ def watching(json: bool) -> Iterator[Report]:
 
 
 class Board:
-    """The cells that are running, newest state of each."""
+    """What the live table shows: the newest state of each running cell, and counts."""
 
-    def __init__(self) -> None:
+    def __init__(self, cells: int) -> None:
         self.running: dict[str, Event] = {}
+        self.ended: set[str] = set()
+        self.cells = cells
 
     def take(self, event: Event) -> bool:
         """Keep the news; whether it is an end."""
         key = event.plan.cell.hash
         if event.kind == "ended":
             self.running.pop(key, None)
+            self.ended.add(key)
             return True
         self.running[key] = event
         return False
 
     def table(self) -> Table:
-        """One row a running cell."""
-        return table(COLUMNS, [row(event) for event in self.running.values()])
+        """One row a running cell, below the counts."""
+        waiting = max(0, self.cells - len(self.ended) - len(self.running))
+        counts = f"{len(self.running)} running, {waiting} waiting, {len(self.ended)} ended"
+        return table(COLUMNS, [row(event) for event in self.running.values()], counts)
 
 
 def row(event: Event) -> tuple[object, ...]:

@@ -34,5 +34,9 @@ def command(
         return
     for line in written.lines:
         say(line)
+    say(f"page: {written.index}")
     for path in written.paths:
-        say(f"  {path}")
+        if path.name == "curve.png":
+            say(f"curve: {path}")
+        elif path.suffix == ".gif":
+            say(f"animation: {path}")

@@ -92,7 +92,7 @@ def command(
     Example:
       solar run --task nav --method solar --seeds 1 --variant smoke
     """
-    from solar_cli.cli.matrix import print_estimates, print_plans, print_results
+    from solar_cli.cli.plans import print_estimates, print_plans, print_results
     from solar_cli.experiment.matrix import plan
     from solar_cli.settings import parse_budget
 
@@ -105,14 +105,16 @@ def command(
 
             print_estimates(plans, estimate(store, plans), workers, json)
             return
-        if any(planned.is_work for planned in plans):
+        work = [planned for planned in plans if planned.is_work]
+        if work:
             require_device(device)
+            require_simulators([planned.cell for planned in work])
         print_plans(plans, json)
 
         from solar_cli.cli.progress import watching
         from solar_cli.experiment.scheduler import run
 
-        with watching(json) as report:
+        with watching(json, len(work)) as report:
             results = run(plans, store, workers=workers, report=report, device=device.value)
     print_results(results, json, db)
     if not all(result.finished for result in results):
@@ -179,3 +181,12 @@ def require_device(device: Device) -> None:
         raise UsageError(
             "--device cuda: torch sees no GPU here; use --device cpu, or install a CUDA build"
         )
+
+
+def require_simulators(cells: Sequence[Cell]) -> None:
+    """Raise `UsageError` where a task cannot be built: an unknown parameter, a missing library."""
+    from solar_cli.envs import build_task
+
+    wanted = {str(task): task for task in (cell.configuration.task for cell in cells)}
+    for task in wanted.values():
+        build_task(task)

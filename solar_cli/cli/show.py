@@ -118,6 +118,8 @@ def _print_changed(changed: list[Line]) -> None:
 
 
 def _print_attempts(attempts: list[AttemptRecord]) -> None:
+    from solar_cli.store.records import Outcome
+
     rows = [
         (
             attempt.number,
@@ -126,7 +128,7 @@ def _print_attempts(attempts: list[AttemptRecord]) -> None:
             attempt.outcome.value if attempt.outcome else "not ended",
             f"{attempt.owner.host}/{attempt.owner.pid}",
             attempt.target,
-            attempt.error or attempt.activity,
+            attempt.error or ("" if attempt.outcome is Outcome.FINISHED else attempt.activity),
         )
         for attempt in attempts
     ]

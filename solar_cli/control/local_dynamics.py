@@ -217,8 +217,8 @@ def _log_density(
     white = torch.linalg.solve_triangular(factor, residual.mT, upper=False)
     log_determinant = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(dim=-1)
     constant = residual.shape[-1] * math.log(2 * math.pi)
-    squared: Tensor = white.square().sum(dim=-2)
-    return -0.5 * (squared + log_determinant[:, None] + constant)
+    density: Tensor = -0.5 * (white.square().sum(dim=-2) + log_determinant[:, None] + constant)
+    return density
 
 
 def _regression(x: Float[Tensor, "T N p"], y: Float[Tensor, "T N d"]) -> Increments:

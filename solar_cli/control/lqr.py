@@ -35,8 +35,7 @@ from solar_cli.control.linear_gaussian import (
 # eta in units of the cost's spread under the old policy, where a step is about a nat. Below the
 # bracket Q_aa loses its digits, above it the policy does not move.
 BELOW, ABOVE = 1e-10, 1e8
-PER_DECADE = 1.5  # members of the first grid
-NEXT_GRID, MOST_REFINEMENTS = 12, 3
+NEXT_GRID, MOST_REFINEMENTS = 10, 3  # the first grid has one eta a decade
 TOLERANCE = 0.03  # share of the bound that may stay unused
 
 
@@ -45,9 +44,11 @@ class Outcome(StrEnum):
 
     CONVERGED = "converged: the KL bound is used up"
     UNCONSTRAINED = "unconstrained: the best policy is within the KL bound"
-    CURVATURE_LIMITED = "curvature limited: Q_aa of a larger step is not positive definite; this is the largest step"
+    CURVATURE_LIMITED = (
+        "curvature limited: Q_aa of any larger step is not positive definite; this is the largest"
+    )
     BRACKET_EXHAUSTED = (
-        "bracket exhausted: no eta uses the KL bound up; the policy returned keeps the bound"
+        "bracket exhausted: no eta uses the KL bound up; the step is smaller than allowed, or none"
     )
     NOT_POSITIVE_DEFINITE = (
         "not positive definite: Q_aa is indefinite or not finite for every eta; the policy is kept"
@@ -178,7 +179,7 @@ def _search(
 ) -> _Found:
     """The smallest eta whose policy keeps the bound, by grids inside a shrinking bracket."""
     low, high = _bracket(previous, dynamics, cost)
-    grid = _log_grid(low, high, round(PER_DECADE * math.log10(high / low)), previous.K)
+    grid = _log_grid(low, high, math.ceil(math.log10(high / low)) + 1, previous.K)
     trial = _candidates(grid, previous, dynamics, cost, std_bounds)
     first = _first_allowed(trial, max_kl)
     if first == len(grid):

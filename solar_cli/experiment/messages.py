@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass
 
-LONGEST = 1000
-"""characters of an activity; lines stay below the size that a pipe writes whole (4096 bytes)"""
+LONGEST = 300
+"""characters of an activity, of up to 12 bytes each: a pipe writes lines of 4096 bytes whole"""
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,9 @@ import time
 from collections.abc import Sequence
 from typing import Any, Protocol
 
+import numpy as np
+import torch
+
 from solar_cli.envs import build_task
 from solar_cli.episodes import Environment, Evaluation
 from solar_cli.errors import SolarError
@@ -114,7 +117,11 @@ class Session:
         self.environment.begin(self._iteration)
         self._tell("starting")
         self._iterating = True
-        learned = self.learner.iterate(self.environment)
+        try:
+            learned = self.learner.iterate(self.environment)
+        except (np.linalg.LinAlgError, torch.linalg.LinAlgError) as error:
+            # What numbers that are no longer finite look like to a factorisation.
+            raise Diverged(str(error)) from error
         self._iterating = False
         train = learned | self.environment.summary(self._iteration)
         self._inside = False

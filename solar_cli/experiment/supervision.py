@@ -13,7 +13,7 @@ from solar_cli.errors import SolarError
 from solar_cli.experiment.engine import Job
 from solar_cli.experiment.matrix import Action, Plan
 from solar_cli.experiment.messages import Message
-from solar_cli.store.records import Fenced, Outcome
+from solar_cli.store.records import AttemptRecord, Fenced, Outcome
 
 if TYPE_CHECKING:
     from solar_cli.store.store import Store
@@ -81,17 +81,23 @@ class Supervision:
 
     def attend(self) -> Result | None:
         """Take in the news and send the heartbeat; the result, when the worker has ended."""
-        ended = self._job.exit_code()  # before the last messages are read
+        code = self._job.exit_code()  # before the last messages are read
         for message in self._job.messages():
             self._hear(message)
+        if code is not None:
+            return self._settle(code)
+        if time.monotonic() - self._beaten < BEAT_SECONDS:
+            return None
         try:
-            if ended is not None:
-                return self._settle(ended)
-            if time.monotonic() - self._beaten >= BEAT_SECONDS:
-                self._beat()
-        except Fenced as error:  # another scheduler has the cell, or somebody removed it
-            self._job.kill()
-            return Result(self.plan, None, str(error))
+            self._beat()
+        except Fenced as error:
+            if self._newest() is None:  # another run has the cell
+                self.kill()
+                return Result(self.plan, None, str(error))
+            # else the worker has just ended the attempt, and will be gone in a moment
+        except SolarError as error:
+            # The worker meets the same trouble where it matters; a late heartbeat does no harm.
+            log.warning("no heartbeat for %s: %s", self.plan.cell.title, error)
         return None
 
     def seconds_left(self) -> float | None:
@@ -118,25 +124,23 @@ class Supervision:
         self._beaten = time.monotonic()
         message = self.message
         activity, fraction = (message.activity, message.fraction) if message else ("starting", 0.0)
-        try:
-            self._store.beat(self.plan.cell.hash, self._attempt, activity, fraction)
-        except Fenced:
-            raise
-        except SolarError as error:
-            # The worker meets the same trouble where it matters; a late heartbeat does no harm.
-            log.warning("no heartbeat for %s: %s", self.plan.cell.title, error)
+        self._store.beat(self.plan.cell.hash, self._attempt, activity, fraction)
+
+    def _newest(self) -> AttemptRecord | None:
+        """The attempt, as long as no other has followed it."""
+        attempts = self._store.attempts(self.plan.cell.hash)
+        return attempts[-1] if attempts and attempts[-1].number == self._attempt else None
 
     def _settle(self, code: int) -> Result:
-        """The end as the worker stored it, or, when it could not, as its exit tells."""
-        cell = self.plan.cell.hash
+        """The end as the worker stored it, or, when it could not, as its exit code tells."""
+        outcome, cause = self._explain(code)
         try:
-            mine = next(a for a in self._store.attempts(cell) if a.number == self._attempt)
-            if mine.outcome is not None:
-                return Result(self.plan, mine.outcome, mine.error or "")
-            outcome, cause = self._explain(code)
-            self._store.end(cell, self._attempt, outcome, cause)
-        except Fenced:
-            raise
+            self._store.end(self.plan.cell.hash, self._attempt, outcome, cause)
+        except Fenced as error:
+            stored = self._newest()
+            if stored is None or stored.outcome is None:
+                return Result(self.plan, None, str(error))
+            return Result(self.plan, stored.outcome, stored.error or "")
         except SolarError as error:
             return Result(self.plan, Outcome.INTERRUPTED, str(error))
         return Result(self.plan, outcome, cause)

@@ -22,6 +22,8 @@ import time
 import traceback
 from collections.abc import Sequence
 
+from sqlalchemy.exc import DBAPIError
+
 from solar_cli.errors import SolarError
 from solar_cli.experiment.messages import Message
 from solar_cli.store.records import Fenced, Outcome
@@ -127,6 +129,7 @@ def compute(store: Store, options: argparse.Namespace, pipe: Pipe) -> tuple[Outc
         except Stopped:
             return Outcome.INTERRUPTED, f"stopped on request in {session.place}"
         except Diverged as error:
+            traceback.print_exc()
             return Outcome.DIVERGED, f"{session.place}: {error}"
     except Fenced:
         raise
@@ -141,10 +144,15 @@ def _failure(error: Exception) -> tuple[Outcome, str]:
         line = str(error)
     else:
         line = traceback.format_exception_only(error)[-1].strip()
-    cause = error if isinstance(error, OSError) else error.__cause__
-    full = isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT)
-    # A full disk is no fault of the cell's: it goes on with the next run, without --retry.
-    return Outcome.INTERRUPTED if full else Outcome.FAILED, line
+    return Outcome.INTERRUPTED if _from_outside(error) else Outcome.FAILED, line
+
+
+def _from_outside(error: BaseException | None) -> bool:
+    """Whether the disk is full or the database fails: the next run goes on, without --retry."""
+    if error is None:
+        return False
+    full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
+    return full or isinstance(error, DBAPIError) or _from_outside(error.__cause__)
 
 
 def prepare_torch(device: str) -> str:
@@ -175,4 +183,8 @@ def _parser() -> argparse.ArgumentParser:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    code = main()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    # All is stored. Taking torch apart object by object would take as long as a small cell does.
+    os._exit(code)

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from solar_cli.errors import UsageError
-from solar_cli.models.likelihoods import LIKELIHOODS, mean_frame
+from solar_cli.models.likelihoods import UNCALIBRATED, calibrated, mean_frame
 from solar_cli.models.networks import build
 from solar_cli.settings.local import Representation
 from solar_cli.settings.task import Observation
@@ -56,7 +56,7 @@ class FrameModel(nn.Module):
             self.log_variance: nn.Module | None = nn.Sequential(nn.Flatten(), log_variance)
         else:
             self.log_variance = None
-        hidden, last = build(settings.decoder, (settings.latent,))
+        hidden, last = build(settings.decoder, (settings.latent,), shape)
         # A decoder that ends in a frame is complete; otherwise one linear layer makes the frame.
         if last == shape:
             self.decoder = hidden
@@ -101,7 +101,10 @@ class FrameModel(nn.Module):
         self, latents: Float[Tensor, "n d"], scaled: Float[Tensor, n * frame]
     ) -> Float[Tensor, ""]:
         """Negative log-likelihood of frames, nats a frame up to a constant."""
-        return LIKELIHOODS[self.settings.likelihood](self.decoder(latents), scaled)
+        outputs, settings = self.decoder(latents), self.settings
+        if settings.likelihood == "calibrated":
+            return calibrated(outputs, scaled, settings.nats, settings.pyramid)
+        return UNCALIBRATED[settings.likelihood](outputs, scaled)
 
     def reconstruct(self, scaled: Float[Tensor, n * frame]) -> Float[Tensor, n * frame]:
         """The expected frame for the encoder's mean, as scaled frames."""

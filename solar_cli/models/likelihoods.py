@@ -13,9 +13,6 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-CALIBRATED_NATS = 64.0
-"""Half the effective dimensions of a frame; measured on the car, the reacher and navigation."""
-
 PYRAMID = ((4, 16.0), (8, 64.0))
 """Side and weight of the pooled residuals: they make small things that are misplaced count."""
 
@@ -30,12 +27,19 @@ def pyramid_error(residual: Float[Tensor, n * frame]) -> Float[Tensor, ""]:
     return error
 
 
-def calibrated(outputs: Float[Tensor, n * frame], frames: Float[Tensor, n * frame]) -> Tensor:
+def calibrated(
+    outputs: Float[Tensor, "n *frame"],
+    frames: Float[Tensor, "n *frame"],
+    nats: float,
+    pyramid: bool,
+) -> Float[Tensor, ""]:
     """A Gaussian whose common scale is the best one: D/2 log of the error (sigma-VAE).
 
-    Rybkin et al. 2021 derive it for plain pixels; the effective D is ours.
+    Rybkin et al. 2021 derive it for plain pixels; the effective D/2, ``nats``, is ours.
     """
-    return CALIBRATED_NATS * pyramid_error(outputs - frames).log()
+    residual = outputs - frames
+    error = pyramid_error(residual) if pyramid else residual.square().mean()
+    return nats * error.log()
 
 
 def gaussian(outputs: Float[Tensor, n * frame], frames: Float[Tensor, n * frame]) -> Tensor:
@@ -68,8 +72,7 @@ def mean_frame(outputs: Tensor, frames: Tensor, likelihood: str) -> Tensor:
     return outputs
 
 
-LIKELIHOODS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
-    "calibrated": calibrated,
+UNCALIBRATED: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "gaussian": gaussian,
     "bernoulli": bernoulli,
     "categorical": categorical,

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from solar_cli.errors import UsageError
 from solar_cli.settings.networks import (
+    Bumps,
     Conv,
     Deconv,
     Layer,
@@ -20,6 +21,10 @@ from solar_cli.settings.networks import (
 )
 
 Shape = tuple[int, ...]
+
+LOG_SPEED = 5.0
+"""Adam moves a parameter by at most its learning rate a step: too little for the log of a width or
+of a temperature, which has to change by whole units within a training. They are held divided by this."""
 
 
 class SpatialSoftmaxLayer(nn.Module):
@@ -45,15 +50,44 @@ class SpatialSoftmaxLayer(nn.Module):
         return torch.cat([x, y], dim=-1)
 
 
-def build(layers: Sequence[Layer], shape: Shape) -> tuple[nn.Sequential, Shape]:
+class BumpsLayer(nn.Module):
+    """A frame as a sum of Gaussian bumps at coordinates that are linear in the input."""
+
+    columns: Tensor
+    rows: Tensor
+
+    def __init__(self, inputs: int, points: int, frame: Shape, width: float) -> None:
+        super().__init__()
+        channels, height, columns = frame
+        self.place = nn.Linear(inputs, 2 * points)
+        nn.init.uniform_(self.place.bias, -0.5, 0.5)
+        self.log_width = nn.Parameter(torch.full((points,), math.log(width) / LOG_SPEED))
+        self.colour = nn.Parameter(torch.randn(channels, points) / math.sqrt(points))
+        self.ground = nn.Parameter(torch.zeros(channels, 1, 1))
+        self.register_buffer("columns", torch.linspace(-1, 1, columns), persistent=False)
+        self.register_buffer("rows", torch.linspace(1, -1, height), persistent=False)
+
+    def forward(self, inputs: Float[Tensor, "n m"]) -> Float[Tensor, "n c h w"]:
+        """Sum over points of colour x down x across: bumps are separable, maps are never made."""
+        x, y = self.place(inputs).chunk(2, dim=-1)
+        scale = (-LOG_SPEED * self.log_width).exp()[:, None]
+        across = (-0.5 * ((self.columns - x.unsqueeze(-1)) * scale).square()).exp()
+        down = (-0.5 * ((self.rows - y.unsqueeze(-1)) * scale).square()).exp()
+        painted = self.colour[:, :, None] * down.unsqueeze(1)
+        frame: Tensor = painted.mT @ across.unsqueeze(1) + self.ground
+        return frame
+
+
+def build(layers: Sequence[Layer], shape: Shape, frame: Shape = ()) -> tuple[nn.Sequential, Shape]:
     """The network and its output shape for inputs of ``shape`` (without the batch axis).
 
+    ``frame`` is the shape of the frames that a decoder draws.
     Raises `UsageError` where a layer does not fit what comes before it.
     """
     modules: list[nn.Module] = []
     for number, layer in enumerate(layers, 1):
         try:
-            added, shape = _layer(layer, shape)
+            added, shape = _layer(layer, shape, frame)
         except (ValueError, ZeroDivisionError) as error:
             raise UsageError(
                 f"layer {number} ({layer.kind}) does not fit an input of shape {shape}: {error}; "
@@ -63,12 +97,16 @@ def build(layers: Sequence[Layer], shape: Shape) -> tuple[nn.Sequential, Shape]:
     return nn.Sequential(*modules), shape
 
 
-def _layer(layer: Layer, shape: Shape) -> tuple[list[nn.Module], Shape]:
+def _layer(layer: Layer, shape: Shape, frame: Shape) -> tuple[list[nn.Module], Shape]:
     if isinstance(layer, Linear):
         width = math.prod(shape)
         flatten = [nn.Flatten()] if len(shape) > 1 else []
         linear = nn.Linear(width, layer.width)
         return [*flatten, linear, *_activation(layer.activation)], (layer.width,)
+    if isinstance(layer, Bumps):
+        if len(shape) != 1 or len(frame) != 3:
+            raise ValueError("it needs a vector, and images to draw")
+        return [BumpsLayer(shape[0], layer.points, frame, layer.width)], frame
     if isinstance(layer, Deconv) and len(shape) == 1:
         shape = (shape[0], 1, 1)
         added, shape = _image_layer(layer, shape)

@@ -74,10 +74,13 @@ def reconstructions(
     settings: TaskSettings, original: NDArray[Any], reconstruction: NDArray[Any]
 ) -> bytes:
     """A PNG with the originals above their reconstructions; both (M, C, H, W) in 0 to 255."""
-    rows = [_side_by_side(_enlarged(settings, frames)[:, None])[0] for frames in (original, reconstruction)]
-    gap = np.full((GAP, *rows[0].shape[1:]), 255, np.uint8)
+    above, below = (
+        _side_by_side(_enlarged(settings, frames)[:, None])[0]
+        for frames in (original, reconstruction)
+    )
+    gap = np.full((GAP, *above.shape[1:]), 255, np.uint8)
     file = io.BytesIO()
-    Image.fromarray(np.concatenate([rows[0], gap, rows[1]])).save(file, format="PNG")
+    Image.fromarray(np.concatenate([above, gap, below])).save(file, format="PNG")
     return file.getvalue()
 
 

@@ -1,4 +1,4 @@
-"""Two methods on the same problems: difference, probability of improvement, episode ratios, verdict.
+"""Two methods on the same problems: difference, probability of improvement, episodes, verdict.
 
 The verdict comes from a permutation test of the probability of improvement at the 5 % level, on one
 number a seed: the headline measure at the end of each curve.
@@ -27,7 +27,7 @@ from solar_cli.reporting.statistics import (
     smallest_p,
 )
 from solar_cli.reporting.summary import CAVEAT, title
-from solar_cli.reporting.tables import Table, bounded, interval, number
+from solar_cli.reporting.tables import Table, bounded, interval, markdown, number, one_line
 from solar_cli.store.store import Store
 
 BASELINE = "solar"
@@ -50,7 +50,7 @@ class Side:
 
 @dataclass(frozen=True)
 class Ratio:
-    """Episodes of the right method over those of the left one, to reach one level."""
+    """Episodes of the left method over those of the right one, to reach one level."""
 
     level: float
     ratio: Bounded
@@ -99,14 +99,14 @@ class Comparison:
     def to_markdown(self) -> str:
         """A heading and a table a problem."""
         return "\n".join(
-            f"## {problem}\n\n{table.to_markdown()}" for problem, table in self.tables.items()
+            f"## {markdown(problem)}\n\n{table.to_markdown()}"
+            for problem, table in self.tables.items()
         )
 
     def to_latex(self) -> str:
         """A tabular a problem."""
         return "\n".join(
-            f"% {problem.replace(chr(10), ' ')}\n{table.to_latex()}"
-            for problem, table in self.tables.items()
+            f"% {one_line(problem)}\n{table.to_latex()}" for problem, table in self.tables.items()
         )
 
     def to_json(self) -> str:
@@ -138,18 +138,24 @@ def compare(store: Store, left: str | None = None, right: str | None = None) -> 
         ]
     else:
         names = [_known(found, left), _known(found, right or BASELINE)]
-        both = [(problem, *(problem.curve(name) for name in names)) for problem in found]
-        pairs = [pair(problem, one, other) for problem, one, other in both if one and other]
+        if names[0] == names[1]:
+            raise UsageError(f"{left!r} and {right or BASELINE!r} are the same: name two")
+        pairs = [
+            pair(problem, one, other)
+            for problem in found
+            if (one := problem.curve(names[0])) and (other := problem.curve(names[1]))
+        ]
     if not pairs:
+        both = "two methods" if left is None else f"both {left!r} and {right or BASELINE!r}"
         raise SolarError(
-            f"nothing to compare in {store.address}: no problem has curves of two methods; "
+            f"nothing to compare in {store}: no problem has curves of {both}; "
             "`solar run --task nav --method solar --method vae --seeds 5` makes some"
         )
     return Comparison(tuple(pairs))
 
 
 def baseline_of(problem: Problem) -> Curve | None:
-    """What others are compared with: ``solar``, else its newest variant by name."""
+    """What others are compared with: ``solar``, else the first of its variants."""
     own = [curve for curve in problem.curves if curve.method == BASELINE and "@" not in curve.label]
     return problem.curve(BASELINE) or (own[0] if own else None)
 
@@ -221,7 +227,7 @@ def _table(pairs: list[Pair]) -> Table:
         "final, right",
         "difference",
         "P(left beats right)",
-        *(f"episodes to {number(level)}, right/left" for level in levels),
+        *(f"episodes to {number(level)}, left / right" for level in levels),
         "left is",
     )
     rows = tuple(
@@ -237,7 +243,8 @@ def _table(pairs: list[Pair]) -> Table:
         for pair in pairs
     )
     said = (
-        f"Final: mean over seeds of {title(first.measure, first.unit, first.better)} at the end of the curve, in episodes.",
+        f"Final: mean over seeds of {title(first.measure, first.unit, first.better)}, at the "
+        "episodes where the curve ends. Ratios of episodes are of the medians over seeds.",
         CAVEAT,
         "Verdicts are of a permutation test at the 5 % level, for each pair on its own: of many "
         "pairs some are decided by chance.",

@@ -79,7 +79,7 @@ def populations(statistic: Statistic) -> Iterator[tuple[str, Draw, Draw, float]]
         yield "the same", normal, normal, 0.5
         yield "shifted", shifted, normal, float(norm.cdf(1 / sqrt(2)))
     else:
-        yield "log-normal", skewed, doubled, 2.0
+        yield "log-normal", doubled, skewed, 2.0
 
 
 def simulate(statistic: Statistic, seeds: int, trials: int = TRIALS) -> dict[str, float]:
@@ -88,21 +88,26 @@ def simulate(statistic: Statistic, seeds: int, trials: int = TRIALS) -> dict[str
 
     from solar_cli.reporting import statistics
 
-    intervals = {
-        "iqm": lambda x, _: statistics.iqm_interval(x, replicates=REPLICATES),
-        "difference": lambda x, y: statistics.difference_interval(x, y, REPLICATES),
-        "improvement": lambda x, y: statistics.improvement_interval(x, y, "higher", REPLICATES),
-        "ratio": lambda x, y: statistics.episode_ratio(
-            np.stack([x, x], axis=-1), np.stack([y, y], axis=-1), REPLICATES
-        )[1],
-    }
+    def interval(
+        x: npt.NDArray[np.float64], y: npt.NDArray[np.float64]
+    ) -> statistics.Interval | None:
+        if statistic == "iqm":
+            return statistics.iqm_interval(x, replicates=REPLICATES)
+        if statistic == "difference":
+            return statistics.difference_interval(x, y, REPLICATES)
+        if statistic == "improvement":
+            return statistics.improvement_interval(x, y, "higher", REPLICATES)
+        known = np.ones(seeds, dtype=bool)
+        left, right = (statistics.episode_bounds(sample, known) for sample in (x, y))
+        return statistics.episode_ratio(left, right, REPLICATES)[1]
+
     shares = {}
     for name, first, second, truth in populations(statistic):
         stream = Streams(0).generator("reporting", "coverage", statistic, name, seeds)
         held = 0
         for _ in range(trials):
-            interval = intervals[statistic](first(stream, seeds), second(stream, seeds))
-            held += interval is not None and interval.low <= truth <= interval.high
+            made = interval(first(stream, seeds), second(stream, seeds))
+            held += made is not None and made.low <= truth <= made.high
         shares[name] = held / trials
     return shares
 

@@ -8,6 +8,7 @@ never in one curve, whatever their names; different code is, with a note.
 
 from __future__ import annotations
 
+import json
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -61,7 +62,7 @@ class SeedCurve:
         return float(ends.max() if self.better == "lower" else ends.min())
 
     def on(self, grid: Counts) -> Array:
-        """Its value at each episode count of ``grid``, none before its first evaluation."""
+        """Its value at each episode count of ``grid``, all from its first evaluation on."""
         values = self.values[np.searchsorted(self.episodes, grid, side="right") - 1]
         if self.diverged:
             values = np.where(grid > self.episodes[-1], self.penalty, values)
@@ -136,9 +137,9 @@ class Curve:
             max(int(seed.episodes[-1]), self.end) if seed.diverged else int(seed.episodes[-1])
             for seed in self.seeds
         ]
-        episodes = [last if first is None else first for first, last in zip(firsts, seen, strict=True)]
-        reached = np.array([first is not None for first in firsts])
-        return episode_bounds(np.array(episodes, dtype=np.float64), reached)
+        pairs = zip(firsts, seen, strict=True)
+        episodes = np.array([last if first is None else first for first, last in pairs], np.float64)
+        return episode_bounds(episodes, np.array([first is not None for first in firsts]))
 
     def count(self, *states: State) -> int:
         """Cells in one of these states."""
@@ -171,11 +172,14 @@ def problems(store: Store) -> list[Problem]:
     groups: dict[tuple[str, str], list[CellRecord]] = defaultdict(list)
     for record in store.cells():
         groups[record.cell.task, _problem_key(record.cell)].append(record)
-    measures = {key: _newest(records).cell.configuration.evaluation for key, records in groups.items()}
+    measures = {
+        key: _newest(records).cell.configuration.evaluation for key, records in groups.items()
+    }
     evaluations = _evaluations(store, {measure.headline for measure in measures.values()})
     titles = _titles(groups)
     found = [
-        _problem(titles[key], records, measures[key], evaluations) for key, records in groups.items()
+        _problem(titles[key], records, measures[key], evaluations)
+        for key, records in groups.items()
     ]
     return sorted(found, key=lambda problem: problem.title)
 
@@ -200,7 +204,8 @@ def _problem(
 ) -> Problem:
     groups: dict[tuple[str, str, str], list[CellRecord]] = defaultdict(list)
     for record in records:
-        groups[record.cell.method, record.cell.variant, _configuration_key(record.cell)].append(record)
+        cell = record.cell
+        groups[cell.method, cell.variant, _configuration_key(cell)].append(record)
     newest = {
         (method, variant): key
         for (method, variant, key), group in sorted(
@@ -256,7 +261,9 @@ def _configuration_key(cell: Cell) -> str:
 def _problem_key(cell: Cell) -> str:
     """Equal where two cells solve the same problem."""
     settings = hashed_values(cell.configuration.task)
-    return repr(sorted((k, v) for k, v in settings.items() if k not in ("observation", "exploration")))
+    for seen_by_the_method in ("observation", "exploration"):
+        settings.pop(seen_by_the_method, None)
+    return json.dumps(settings, sort_keys=True)
 
 
 def _titles(groups: dict[tuple[str, str], list[CellRecord]]) -> dict[tuple[str, str], str]:

@@ -14,13 +14,12 @@ from solar_cli.store.store import Store
 
 
 def codes(store: Store, curve: Curve) -> dict[str, list[int]]:
-    """Names of the code that computed a curve, each with its seeds; of all attempts of a seed.
-
-    Uncommitted changes are told apart by the first digits of their hash.
-    """
+    """Names of the code that computed a curve, each with its seeds; of all attempts of a seed."""
     names: dict[str, list[int]] = {}
     for seed in curve.seeds:
-        for name in sorted({_name(provenance) for provenance in _provenances(store, seed.record)}):
+        for name in sorted(
+            {code_label(provenance) for provenance in _provenances(store, seed.record)}
+        ):
             names.setdefault(name, []).append(seed.seed)
     return names
 
@@ -32,7 +31,8 @@ def _provenances(store: Store, record: CellRecord) -> list[dict[str, Any]]:
     return [attempt.provenance for attempt in store.attempts(record.hash)]
 
 
-def _name(provenance: Mapping[str, Any]) -> str:
+def code_label(provenance: Mapping[str, Any]) -> str:
+    """`code_name`, with the first digits of the hash of what was not committed."""
     changes = provenance.get("diff_sha256")
     return code_name(provenance) + (f" {str(changes)[:6]}" if changes else "")
 
@@ -77,5 +77,5 @@ def _code_notes(store: Store, curve: Curve, present: Mapping[str, Any]) -> list[
         lines.append(f"computed with uncommitted changes: {next(iter(names))}")
     stale = [seed.seed for seed in curve.seeds if is_stale(seed.record, present)]
     if stale:
-        lines.append(f"stale: seeds {ranges(stale)} were not computed by {code_name(present)}")
+        lines.append(f"stale: seeds {ranges(stale)} were not computed by {code_label(present)}")
     return lines

@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 import textwrap
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import matplotlib as mpl
 import numpy as np
@@ -25,9 +25,12 @@ FileFormat = Literal["png", "svg", "pdf"]
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Okabe and Ito 2008: told apart with any common colour blindness."""
+PALE_PALETTE = ("#4FA8E0", "#F08040", "#2FBF8F", "#E093BF", "#F0B840", "#8FD0F5")
+"""The same hues, lighter, for a dark ground."""
 DASHES: tuple[tuple[float, ...], ...] = ((), (5, 1.5), (1.5, 1.5), (6, 1.5, 1.5, 1.5))
-"""With the palette: as many looks as their product, and no two curves differ by colour alone up to
-four."""
+"""Up to four curves differ by more than their colour."""
+LEGEND_COLUMNS = 2
+"""Below the axes, so that the figure stays readable at the width of a phone."""
 LOG_SPAN = 20.0
 """A measure whose best mean is this many times below its worst gets a logarithmic axis."""
 LOG_EPISODES = 20.0
@@ -36,24 +39,26 @@ LOG_EPISODES = 20.0
 
 @dataclass(frozen=True)
 class Theme:
-    """Colours of everything but the curves."""
+    """Colours of a figure."""
 
     ink: str
     faint: str
     paper: str | None
     """None leaves the ground transparent"""
+    palette: tuple[str, ...]
+    """of the curves, in their order"""
 
 
-LIGHT = Theme("#1f2328", "#8c959f", "#ffffff")
-DARK = Theme("#e6edf3", "#7d8590", None)
+LIGHT = Theme("#1f2328", "#8c959f", "#ffffff", PALETTE)
+DARK = Theme("#e6edf3", "#7d8590", None, PALE_PALETTE)
 
-STYLE = {
-    "font.size": 10,
+STYLE: dict[Any, Any] = {
+    "font.size": 11,
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans"],
-    "axes.labelsize": 10,
-    "axes.titlesize": 11,
-    "legend.fontsize": 9,
+    "axes.labelsize": 11,
+    "axes.titlesize": 12,
+    "legend.fontsize": 10,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "lines.solid_capstyle": "round",
@@ -68,24 +73,33 @@ def learning_curve(problem: Problem, theme: Theme = LIGHT) -> Figure:
     """The headline measure of every curve of a problem against episodes."""
     measure = problem.measure
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(6.4, 4.0), layout="constrained")
+        rows = -(-len(problem.curves) // LEGEND_COLUMNS)
+        figure = Figure(figsize=(5.6, 3.8 + 0.35 * rows), layout="constrained")
         axes = figure.add_subplot()
         for index, curve in enumerate(problem.curves):
-            _draw(axes, curve, index)
+            dashes = DASHES[index % len(DASHES)]
+            _draw(axes, curve, theme.palette[index % len(theme.palette)], dashes)
         _scale(axes, problem)
         _levels(axes, measure.levels, theme)
-        axes.set_title(problem.title, loc="left", fontweight="bold")
-        axes.set_xlabel("episodes")
-        axes.set_ylabel(textwrap.fill(title(measure.headline, measure.unit, measure.better), 40))
-        legend = axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+        axes.set_title(problem.title, loc="left", fontweight="bold", color=theme.ink)
+        axes.set_xlabel("episodes", color=theme.ink)
+        axes.set_ylabel(
+            textwrap.fill(title(measure.headline, measure.unit, measure.better), 40),
+            color=theme.ink,
+        )
+        figure.legend(
+            loc="outside lower center",
+            ncols=min(LEGEND_COLUMNS, len(problem.curves)),
+            frameon=False,
+            labelcolor=theme.ink,
+        )
         _colour(figure, axes, theme)
-        for text in legend.get_texts():
-            text.set_color(theme.ink)
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")  # one layout for all formats, whichever is first
     return figure
 
 
-def _draw(axes: Axes, curve: Curve, index: int) -> None:
-    colour = PALETTE[index % len(PALETTE)]
+def _draw(axes: Axes, curve: Curve, colour: str, dashes: tuple[float, ...]) -> None:
     for seed in curve.seeds:
         axes.plot(seed.episodes, seed.values, color=colour, linewidth=0.7, alpha=0.35)
         if (mark := _mark(seed)) is not None:
@@ -101,7 +115,7 @@ def _draw(axes: Axes, curve: Curve, index: int) -> None:
         mean,
         color=colour,
         linewidth=2.0,
-        dashes=DASHES[index % len(DASHES)],
+        dashes=dashes,
         marker="o" if len(curve.grid) == 1 else None,
         label=label(curve),
     )
@@ -132,7 +146,8 @@ def _scale(axes: Axes, problem: Problem) -> None:
     means = np.concatenate([curve.mean for curve in problem.curves])
     measured = np.concatenate([seed.values for curve in problem.curves for seed in curve.seeds])
     ends = [max(int(seed.episodes[-1]) for seed in curve.seeds) for curve in problem.curves]
-    if problem.measure.better == "lower" and measured.min() > 0 and means.max() > LOG_SPAN * means.min():
+    positive = problem.measure.better == "lower" and measured.min() > 0
+    if positive and means.max() > LOG_SPAN * means.min():
         axes.set_yscale("log")
         axes.set_ylim(measured.min() / 1.3, measured.max() * 1.3)
         axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
@@ -162,8 +177,6 @@ def _colour(figure: Figure, axes: Axes, theme: Theme) -> None:
     axes.tick_params(which="both", colors=theme.ink)
     for name in ("left", "bottom"):
         axes.spines[name].set_color(theme.faint)
-    for text in (axes.xaxis.label, axes.yaxis.label, axes._left_title):  # type: ignore[attr-defined]
-        text.set_color(theme.ink)
 
 
 def render(figure: Figure, format: FileFormat) -> bytes:

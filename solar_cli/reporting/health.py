@@ -25,7 +25,6 @@ class Vital:
     """over seeds, of each seed's newest value"""
     low: float
     high: float
-    seeds: int
     spark: str
     """points of an SVG polyline in a box of 100 x 20: its mean over seeds against iterations"""
 
@@ -48,7 +47,10 @@ class Chart:
 def chart(store: Store, curves: Sequence[Curve]) -> Chart:
     """The vitals of the latest iterations that have them."""
     columns = [_vitals(store, curve) for curve in curves]
-    names = sorted({name for column in columns for name in column}, key=lambda n: (n[0] != "train", n[1]))
+    names = sorted(
+        {name for column in columns for name in column},
+        key=lambda name: (SPLITS.index(name[0]), name[1]),
+    )
     return Chart(
         tuple(curve.label for curve in curves),
         tuple(
@@ -75,12 +77,10 @@ def _vital(seeds: Sequence[dict[int, float]]) -> Vital:
     """From iteration -> value of each seed."""
     newest = np.array([values[max(values)] for values in seeds])
     iterations = sorted({iteration for values in seeds for iteration in values})
-    means = np.array(
-        [np.mean([values[i] for values in seeds if i in values]) for i in iterations]
-    )
+    means = np.array([np.mean([values[i] for values in seeds if i in values]) for i in iterations])
     with np.errstate(invalid="ignore"):
         mean = float(newest.mean())
-    return Vital(mean, float(newest.min()), float(newest.max()), len(newest), spark(iterations, means))
+    return Vital(mean, float(newest.min()), float(newest.max()), spark(iterations, means))
 
 
 def spark(iterations: Sequence[int], values: Array) -> str:

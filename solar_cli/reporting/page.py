@@ -27,11 +27,12 @@ def page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["data_uri"] = data_uri
+    environment.filters |= {"data_uri": data_uri, "zip": zip}
     return environment.get_template("page.html").render(
         sections=sections,
         cells=cells,
-        troubled=[line for line in cells if line.needs_a_look],
+        failed=[line for line in cells if line.failed],
+        stale=[line for line in cells if line.stale],
         origins=origins,
         origin_columns=ORIGIN_COLUMNS,
         made_by=made_by,

@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from solar_cli.errors import SolarError
-from solar_cli.experiment.provenance import code, code_name
+from solar_cli.experiment.provenance import code
 from solar_cli.reporting.curves import Problem, problems
+from solar_cli.reporting.evidence import code_label
 from solar_cli.reporting.page import page
 from solar_cli.reporting.publishing import publish
 from solar_cli.reporting.sections import MEMORY, Section, cell_lines, origins, section
@@ -55,7 +56,7 @@ def report(store: Store, out: Path) -> Report:
     files: dict[str, bytes] = {}
     for name, part in zip(file_names(p.title for p in found), sections, strict=True):
         files |= {f"{name}/{file}": content for file, content in _files(part).items()}
-    html = page(sections, cell_lines(records, present), origins(records), code_name(present))
+    html = page(sections, cell_lines(records, present), origins(records), code_label(present))
     files["index.html"] = html.encode()
     paths = publish(out, files)
     lines = [line(part.problem, summary) for part in sections for summary in part.summaries]
@@ -113,13 +114,10 @@ def _csv(rows: Sequence[Mapping[str, Any]]) -> bytes:
 
 def file_names(titles: Iterable[str]) -> list[str]:
     """A file name for each title, safe on any system, and no two alike."""
-    return [_file_name(title) for title in titles]
-
-
-def _file_name(title: str) -> str:
-    name = re.sub(r"[^a-z0-9_.-]+", "-", title).strip(".-")
-    # `:` and `@` come from labels, whose other characters are plain: `-` cannot make two alike
-    # unless a name was foreign to begin with; then its hash tells them apart.
-    if re.fullmatch(r"[a-z0-9_.-]+([:@][a-z0-9_.-]+)*", title):
-        return name
-    return f"{name[:40]}-{hashlib.sha256(title.encode()).hexdigest()[:8]}".lstrip("-")
+    names: list[str] = []
+    for title in titles:
+        name = re.sub(r"[^a-z0-9_.-]+", "-", title).strip(".-")
+        if not re.fullmatch(r"[a-z0-9_.:@-]+", title) or name in ("", *names):
+            name += f"-{hashlib.sha256(title.encode()).hexdigest()[:8]}"
+        names.append(name.lstrip("-"))
+    return names

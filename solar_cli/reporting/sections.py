@@ -1,4 +1,4 @@
-"""Everything that a report says of one problem, and of the store as a whole, ready to be written."""
+"""Everything that a report says of one problem, and of the store, ready to be written."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Any
 
 from solar_cli.errors import SolarError
 from solar_cli.experiment.matrix import is_stale
-from solar_cli.experiment.provenance import code_name
 from solar_cli.reporting import figures, health
 from solar_cli.reporting.animation import animation, arrays, reconstructions
 from solar_cli.reporting.compare import Comparison, baseline_of, compare_curves
 from solar_cli.reporting.curves import Curve, Problem, SeedCurve
+from solar_cli.reporting.evidence import code_label
 from solar_cli.reporting.summary import Summary, duration, summarise, table
 from solar_cli.reporting.tables import Table
 from solar_cli.settings import TaskSettings
@@ -158,12 +158,12 @@ class CellLine:
     def code(self) -> str:
         """Name of the newest attempt's code."""
         last = self.record.last_attempt
-        return code_name(last.provenance) if last else ""
+        return code_label(last.provenance) if last else ""
 
     @property
-    def needs_a_look(self) -> bool:
-        """Whether it belongs under the failures."""
-        return self.stale or self.record.state in (State.FAILED, State.DIVERGED)
+    def failed(self) -> bool:
+        """Whether a person must look at it."""
+        return self.record.state in (State.FAILED, State.DIVERGED)
 
 
 def cell_lines(records: list[CellRecord], present: Mapping[str, Any]) -> list[CellLine]:

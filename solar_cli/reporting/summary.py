@@ -174,24 +174,20 @@ def line(problem: Problem, summary: Summary) -> str:
 
 def flat(problem: Problem, summary: Summary) -> dict[str, Any]:
     """One row of numbers for a spreadsheet."""
-    row = {"problem": problem.title, "measure": problem.measure.headline}
-    row |= {
-        key: value
-        for key, value in asdict(summary).items()
-        if key not in ("interval", "levels", "codes", "notes")
-    }
     shown = summary.interval
+    row: dict[str, Any] = {"problem": problem.title, "measure": problem.measure.headline}
     row |= {
-        "iqm_low": shown.low if shown else None,
-        "iqm_high": shown.high if shown else None,
-        "iqm_coverage": shown.coverage if shown else None,
+        name: value
+        for name, value in asdict(summary).items()
+        if name not in ("interval", "levels", "codes", "notes")
     }
+    row["iqm_low"] = shown.low if shown else None
+    row["iqm_high"] = shown.high if shown else None
+    row["iqm_coverage"] = shown.coverage if shown else None
     for level in summary.levels:
         name = f"episodes_to_{number(level.level)}"
-        row |= {
-            f"{name}_low": level.episodes.low,
-            f"{name}_high": level.episodes.high,
-            f"{name}_reached": level.reached,
-        }
+        row[f"{name}_low"] = level.episodes.low
+        row[f"{name}_high"] = level.episodes.high
+        row[f"{name}_reached"] = level.reached
     row["code"] = "; ".join(summary.codes)
     return row

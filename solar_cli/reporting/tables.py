@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -35,7 +36,7 @@ class Table:
         lines = [_pipes(self.columns), "|" + "---|" * len(self.columns)]
         lines += [_pipes(row) for row in self.rows]
         if self.notes:
-            lines += ["", *(f"- {_markdown(note)}" for note in self.notes)]
+            lines += ["", *(f"- {markdown(note)}" for note in self.notes)]
         return "\n".join(lines) + "\n"
 
     def to_latex(self) -> str:
@@ -56,14 +57,18 @@ class Table:
 
 
 def _pipes(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(_markdown(cell) for cell in cells) + " |"
+    return "| " + " | ".join(markdown(cell) for cell in cells) + " |"
 
 
-def _markdown(text: str) -> str:
-    """Inert in Markdown that allows HTML, and on one line of a pipe table."""
-    for character, entity in (("&", "&amp;"), ("<", "&lt;"), ("|", "\\|"), ("\n", " ")):
-        text = text.replace(character, entity)
-    return text
+def one_line(text: str) -> str:
+    """``text`` without line breaks and without anything that a terminal would obey."""
+    return " ".join("".join(c if c.isprintable() else " " for c in text).split())
+
+
+def markdown(text: str) -> str:
+    """Inert in a line or a cell: what might start a tag or an entity is escaped."""
+    text = re.sub(r"&(?=[#\w])", "&amp;", one_line(text))
+    return re.sub(r"<(?=\S)", "&lt;", text).replace("|", "\\|")
 
 
 def _ampersands(cells: Sequence[str]) -> str:
@@ -72,7 +77,7 @@ def _ampersands(cells: Sequence[str]) -> str:
 
 def latex(text: str) -> str:
     """``text`` as LaTeX shows it, special characters escaped."""
-    return "".join(LATEX.get(character, character) for character in text.replace("\n", " "))
+    return "".join(LATEX.get(character, character) for character in one_line(text))
 
 
 def number(value: float) -> str:
@@ -94,9 +99,10 @@ def bounded(value: Bounded) -> str:
     """``80``, ``> 240`` for a lower bound, ``< 3`` for an upper one."""
     if value.low == value.high:
         return number(value.low)
-    if math.isinf(value.high):
-        return f"> {number(value.low)}" if value.low > 0 else "unknown"
-    return f"{number(value.low)} to {number(value.high)}" if value.low > 0 else f"< {number(value.high)}"
+    low, high = number(value.low), number(value.high)
+    if value.low == 0:
+        return "unknown" if math.isinf(value.high) else f"< {high}"
+    return f"> {low}" if math.isinf(value.high) else f"{low} to {high}"
 
 
 def ranges(numbers: Sequence[int]) -> str:

@@ -41,6 +41,12 @@ class Representation(Settings):
         "calibrated",
         "p(s|z): Gaussian with the best common scale on an image pyramid, or as App. D says",
     )
+    nats: float = setting(
+        64.0, "calibrated: half the dimensions of a frame that count, weight of the log error", gt=0
+    )
+    pyramid: bool = setting(
+        True, "calibrated: errors of pooled frames count too, so that small misplaced things do"
+    )
     input: Literal["standardised", "unit"] = setting(
         "standardised", "(x - mean image) / pixel std, or x in [0, 1]"
     )

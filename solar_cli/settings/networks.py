@@ -54,7 +54,22 @@ class Deconv(Settings):
     activation: Literal["relu", "none"] = setting("relu", "what follows")
 
 
-Layer = Annotated[Unshuffle | Conv | SpatialSoftmax | Linear | Deconv, Field(discriminator="kind")]
+class Bumps(Settings):
+    """Draw a frame as a sum of Gaussian bumps at coordinates that are linear in the input.
+
+    The decoder's counterpart of a spatial softmax: what it draws moves as its input moves. It is
+    the last layer of a list.
+    """
+
+    kind: Literal["bumps"] = "bumps"
+    points: int = setting(..., "bumps, each with a learned width and a colour", ge=1)
+    width: float = setting(0.3, "initial std of a bump; the image is 2 wide", gt=0)
+
+
+Layer = Annotated[
+    Unshuffle | Conv | SpatialSoftmax | Linear | Deconv | Bumps,
+    Field(discriminator="kind"),
+]
 
 KEY_POINTS: tuple[Layer, ...] = (
     Unshuffle(factor=4),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Collection, Iterable, Sequence
 from typing import Any
@@ -34,7 +35,7 @@ class Cells(Opened):
                     method=cell.method,
                     variant=cell.variant,
                     seed=cell.seed,
-                    configuration=cell.config(),
+                    configuration=json.dumps(cell.config()),
                     created=now,
                 )
                 for hash, cell in wanted.items()

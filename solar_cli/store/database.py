@@ -175,6 +175,11 @@ def explain(error: DBAPIError, location: Location) -> Exception:
         if code.startswith(prefix):
             return kind(f"database {location}: {message} ({cause})")
     if not code and isinstance(error, OperationalError):
+        if getattr(error.orig, "sqlstate", None):
+            return SolarError(
+                f"database {location}: its server failed; nothing stored is lost: see to it, then "
+                f"try again ({cause})"
+            )
         return UsageError(
             f"database {location} cannot be reached ({cause}): start the server, or correct the "
             "address in --db or SOLAR_DB"
@@ -196,6 +201,10 @@ SQLITE_ERRORS: dict[str, tuple[type[SolarError], str]] = {
     "SQLITE_IOERR": (
         SolarError,
         "its disk cannot be read or written; check the disk and its free space, then try again",
+    ),
+    "SQLITE_PROTOCOL": (
+        SolarError,
+        "its file system cannot lock files; keep it on a local disk, or use PostgreSQL",
     ),
     "SQLITE_READONLY": (UsageError, "it or its folder cannot be written; name another in --db"),
     "SQLITE_CANTOPEN": (

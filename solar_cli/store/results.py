@@ -143,7 +143,7 @@ class Results(Opened):
         It replaces the one of the same kind, whose file goes. Raises `Fenced`.
         """
         folder = self.folder(hash)
-        name = path.resolve().relative_to(folder).as_posix()
+        name = path.resolve().relative_to(folder.resolve()).as_posix()
         with path.open("rb") as file:
             sha256 = hashlib.file_digest(file, "sha256").hexdigest()
         with self._database.writing() as session:

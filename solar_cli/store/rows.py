@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable
 from dataclasses import asdict, fields
 from datetime import datetime, timedelta
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -43,19 +45,25 @@ def restored(row: CellRow) -> Cell:
     """The cell of a row. It keeps the hash that it was stored under, whatever became of its
     settings' models, and it can be read when the package of its method is gone.
     """
-    config = row.configuration
+    configuration = _configuration(row.method, row.configuration)
+    cell = Cell(row.task, row.method, row.variant, row.seed, configuration)
+    cell.__dict__["hash"] = row.hash  # where the cached property keeps it
+    return cell
+
+
+@lru_cache(maxsize=256)
+def _configuration(method_name: str, text: str) -> Configuration:
+    """A stored configuration; the seeds of one variant share one, and it is validated once."""
+    config = json.loads(text)
     try:
-        cell = restore(row.task, row.method, row.variant, row.seed, config)
+        return restore("", method_name, "", 0, config).configuration
     except (SolarError, ImportError, AttributeError, ValidationError):
         parts = {
             "task": _settings(lambda: TaskSettings, config["task"]),
             "evaluation": _settings(lambda: EvaluationSettings, config["evaluation"]),
-            "method": _settings(lambda: settings_class(method(row.method)), config["method"]),
+            "method": _settings(lambda: settings_class(method(method_name)), config["method"]),
         }
-        configuration = Configuration.model_construct(None, **parts)
-        cell = Cell(row.task, row.method, row.variant, row.seed, configuration)
-    cell.__dict__["hash"] = row.hash  # where the cached property keeps it
-    return cell
+        return Configuration.model_construct(None, **parts)
 
 
 def _settings(model: Callable[[], type[Settings]], values: dict[str, Any]) -> Settings:

@@ -77,8 +77,8 @@ class CellRow(Base):
     method: Mapped[str] = mapped_column(doc="name of the method")
     variant: Mapped[str] = mapped_column(doc="name of the overrides of the card; default if none")
     seed: Mapped[int] = mapped_column(doc="of all random streams")
-    configuration: Mapped[dict[str, Any]] = mapped_column(
-        doc="every resolved setting: tables task, evaluation, method"
+    configuration: Mapped[str] = mapped_column(
+        doc="JSON of every resolved setting: tables task, evaluation, method"
     )
     created: Mapped[datetime] = mapped_column(doc="when it was first asked for (UTC)")
     iteration: Mapped[int] = mapped_column(default=0, doc="of the newest commit")

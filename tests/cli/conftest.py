@@ -7,18 +7,22 @@ import pytest
 from scenario import HOSTILE, Done, Solar, Stored, compute
 
 from solar_cli.cli import main
-from solar_cli.experiment.provenance import code
 from solar_cli.settings import cells, load_card
 from solar_cli.store.records import Outcome
 from solar_cli.store.store import Store
+
+CODE = {"version": "1.0", "commit": "1" * 40, "dirty": False, "diff_sha256": None, "diff": ""}
+"""The code that computed, and now looks: the real one may be edited while the tests run."""
 
 
 @pytest.fixture
 def solar(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> Solar:
-    """The command ``solar`` in an empty folder."""
+    """The command ``solar`` in an empty folder, run by the code that the database knows."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("solar_cli.experiment.provenance.code", lambda: CODE)
+    monkeypatch.setattr("solar_cli.experiment.matrix.code", lambda: CODE)
     monkeypatch.delenv("SOLAR_DB", raising=False)
     monkeypatch.delenv("SOLAR_HOME", raising=False)
 
@@ -40,8 +44,7 @@ def template(tmp_path_factory: pytest.TempPathFactory) -> Stored:
     stored = Stored(
         folder / "solar.db", finished, second, stale, diverged, failed, interrupted, pending
     )
-    here = code()
-    elsewhere = {**here, "commit": "0" * 40, "dirty": False, "diff": "", "diff_sha256": None}
+    here, elsewhere = CODE, {**CODE, "commit": "0" * 40}
     with Store.open(str(stored.db)) as store:
         everything = [finished, second, stale, interrupted, diverged, failed, pending]
         store.add(everything)

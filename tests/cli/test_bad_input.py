@@ -15,6 +15,11 @@ FAULTS = {
     "unknown variant": (("--variant", "smok"), ["'smok'", "did you mean 'smoke'"]),
     "unknown setting": (("--set", "task.horzon=3"), ["task.horzon", "did you mean 'horizon'"]),
     "ill-typed setting": (("--set", 'task.horizon="x"'), ["task.horizon", "integer", "'x'"]),
+    "unknown parameter of the simulator": (
+        ("--set", "task.parameters.gaol=[0.0, 0.0]"),
+        ["'gaol'", "did you mean 'goal'"],
+    ),
+    "unknown simulator": (("--set", 'task.simulator="nav"'), ["'nav'", "navigation"]),
     "no TOML": (("--set", "task.horizon=ten"), ["'ten'", "quotes"]),
     "no assignment": (("--set", "task.horizon"), ["PATH=VALUE"]),
     "setting of a method that does not run": (

@@ -54,6 +54,15 @@ def test_log_posterior_is_the_log_likelihood_but_for_the_weak_prior():
     assert fit.log_posterior[-1] == pytest.approx(np.log(density).sum(), abs=0.1)
 
 
+def test_one_cluster_is_the_data_s_gaussian_with_its_variances_barely_weighted_up():
+    points = clusters()[0]
+    mixture = gmm.fit_mixture(torch.as_tensor(points), 1, np.random.default_rng(1)).mixture
+    covariance = np.cov(points.T, bias=True)
+    expected = (covariance + 1e-6 * np.diag(np.diag(covariance))) / (1 + 1e-6)
+    np.testing.assert_allclose(mixture.means[0], points.mean(0), rtol=1e-12)
+    np.testing.assert_allclose(mixture.covariances[0], expected, rtol=1e-10)
+
+
 def test_same_generator_gives_the_same_mixture():
     points = torch.as_tensor(clusters()[0])
     first, second = (gmm.fit_mixture(points, 4, np.random.default_rng(3)).mixture for _ in "ab")

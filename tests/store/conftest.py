@@ -1,7 +1,10 @@
 """A store of each kind of database, and what the tests of it need to write results."""
 
 import os
+import shutil
+import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,12 +18,20 @@ from solar_cli.store.store import Store
 
 
 @pytest.fixture(scope="session")
-def postgresql(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def postgresql() -> Iterator[str]:
     """Address of a PostgreSQL server of this session."""
     pgserver = pytest.importorskip("pgserver", reason="needs pgserver to start PostgreSQL")
     pytest.importorskip("psycopg", reason="needs psycopg to reach PostgreSQL")
-    with pgserver.get_server(tmp_path_factory.mktemp("pg"), cleanup_mode="delete") as server:
-        yield server.get_uri()
+    # Not below pytest's folder: as root the server runs as another user, and every start of
+    # pytest on the machine closes that folder to others.
+    folder = Path(tempfile.mkdtemp(prefix="solar-postgresql-"))
+    try:
+        with pgserver.get_server(folder, cleanup_mode="stop") as server:
+            yield server.get_uri()
+    except subprocess.SubprocessError as error:
+        pytest.skip(f"PostgreSQL does not start here: {error}")
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])

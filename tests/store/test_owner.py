@@ -1,6 +1,7 @@
 """An owner is a process, not a number; when it is gone its cell is free at once."""
 
 import os
+import shutil
 import signal
 import subprocess
 import time
@@ -18,10 +19,11 @@ from solar_cli.store.store import Store
 
 
 @pytest.fixture
-def other() -> Iterator[subprocess.Popen[bytes]]:
+def other(tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
     """A process with a name that makes its line in /proc hard to read."""
-    command = ["bash", "-c", "exec -a 'a) Z (b' sleep 60"]
-    with subprocess.Popen(command) as process:
+    name = tmp_path / "a) Z (b"
+    name.symlink_to(shutil.which("sleep") or "/bin/sleep")
+    with subprocess.Popen([name, "60"]) as process:
         yield process
         process.kill()
 

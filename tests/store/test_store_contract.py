@@ -211,6 +211,23 @@ def test_an_owner_that_cannot_be_seen_keeps_its_cell_for_the_lease(
     assert "elsewhere" in first.error
 
 
+def test_every_sign_of_life_renews_the_lease(
+    store: Store, make_cells: MakeCells, commit: Commit
+) -> None:
+    (cell,) = make_cells(0)
+    store.add([cell])
+    attempt = store.claim(cell.hash, ELSEWHERE, 100, {})
+    signs: list[Callable[[], None]] = [
+        lambda: store.beat(cell.hash, attempt, "working", 0.5),
+        lambda: commit(store, cell.hash, attempt, 1),
+    ]
+    for sign in signs:
+        heard(store, 61)
+        assert store.find(cell.hash).state is State.INTERRUPTED
+        sign()
+        assert store.find(cell.hash).state is State.RUNNING
+
+
 def test_every_write_of_a_late_writer_is_refused_and_changes_nothing(
     store: Store, make_cells: MakeCells, me: Owner, commit: Commit
 ) -> None:

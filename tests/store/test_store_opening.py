@@ -7,11 +7,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from sqlalchemy.exc import OperationalError
 
 from solar_cli.errors import SolarError, UsageError
 from solar_cli.settings import Cell
 from solar_cli.store import database
 from solar_cli.store.address import locate
+from solar_cli.store.database import explain
 from solar_cli.store.store import Store
 
 MakeCells = Callable[..., list[Cell]]
@@ -223,6 +225,43 @@ def test_a_full_disk_loses_nothing_and_work_goes_on_once_there_is_room(
         driver.execute("PRAGMA max_page_count = 100000")
     store.add(make_cells(*range(1, 100)))
     assert len(store.cells()) == 100
+
+
+def sqlite_error(code: str) -> sqlite3.Error:
+    error = sqlite3.OperationalError("what SQLite says\nand more")
+    error.sqlite_errorname = code
+    return error
+
+
+def server_error(state: str | None) -> Exception:
+    error = Exception("what the server says\nand more")
+    error.sqlstate = state  # type: ignore[attr-defined]
+    return error
+
+
+@pytest.mark.parametrize(
+    ("cause", "kind", "says"),
+    [
+        (sqlite_error("SQLITE_IOERR_WRITE"), SolarError, "check the disk"),
+        (sqlite_error("SQLITE_PROTOCOL"), SolarError, "local disk"),
+        (sqlite_error("SQLITE_CORRUPT_INDEX"), SolarError, "damaged"),
+        (server_error("53100"), SolarError, "its server failed"),  # disk full
+        (server_error(None), UsageError, "cannot be reached"),
+    ],
+)
+def test_a_failing_database_is_one_line_with_its_cause(
+    cause: Exception, kind: type[SolarError], says: str
+) -> None:
+    error = explain(OperationalError("SELECT", {}, cause), locate("some.db"))
+    assert type(error) is kind
+    assert says in str(error)
+    assert "says" in str(error)
+    refused(error, "some.db")
+
+
+def test_a_mistake_of_ours_is_not_explained_away() -> None:
+    error = OperationalError("SELECT", {}, sqlite_error("SQLITE_ERROR"))
+    assert explain(error, locate("some.db")) is error
 
 
 def test_listing_cells_imports_nothing_heavy(

@@ -1,4 +1,4 @@
-"""Random search: the gains of a linear policy, found by the cross-entropy method from costs alone.
+"""Random search: the gains of a linear policy, found from costs alone (Mania et al. 2018).
 
 What the policy sees of an image is where the brightness of each channel has its centre.
 """
@@ -19,8 +19,8 @@ Floats = NDArray[np.float64]
 
 ENTRY = MethodEntry(
     name="random-search",
-    summary="The gains of a linear policy by the cross-entropy method.",
-    source="Rubinstein and Kroese 2004",
+    summary="The gains of a linear policy, moved against the costs of random changes to them.",
+    source="Mania et al. 2018",
     settings="solar_random_search:RandomSearchSettings",
     learner="solar_random_search:RandomSearch",
 )
@@ -29,10 +29,10 @@ ENTRY = MethodEntry(
 class RandomSearchSettings(Settings):
     """What a card may say under [methods.random-search]."""
 
-    budget: Budget = setting(Budget(desk=400, full=2000), "where to stop", presentation=True)
-    population: int = setting(20, "policies tried in an iteration, one episode each", ge=4)
-    elite: int = setting(5, "best policies that the next population is drawn around", ge=2)
-    spread: float = setting(1.0, "initial standard deviation of a gain", gt=0)
+    budget: Budget = setting(Budget(desk=1000, full=5000), "where to stop", presentation=True)
+    population: int = setting(50, "changes tried in an iteration, one episode each", ge=2)
+    spread: float = setting(0.5, "standard deviation of a change to a gain", gt=0)
+    rate: float = setting(1.0, "step along the changes that lowered the cost", gt=0)
 
 
 def features(observations: NDArray[Any]) -> Floats:
@@ -62,7 +62,7 @@ class LinearPolicy:
 
 
 class RandomSearch:
-    """The learner: one iteration tries a population and moves towards its best."""
+    """The learner: one iteration tries a population of changes and steps against their costs."""
 
     def __init__(
         self,
@@ -75,32 +75,33 @@ class RandomSearch:
         self.settings, self.streams, self.pulse = settings, streams, pulse
         seen = task.observation
         size = 1 + (2 * seen.channels if seen.kind == "image" else seen.width)
-        self.mean: Floats = np.zeros((task.action.size, size))
-        self.std: Floats = np.full_like(self.mean, settings.spread)
+        self.gains: Floats = np.zeros((task.action.size, size))
 
     @property
     def policy(self) -> LinearPolicy:
         """The policy that it would hand over now."""
-        return LinearPolicy(self.mean[None])
+        return LinearPolicy(self.gains[None])
 
     def iterate(self, environment: Environment) -> dict[str, float]:
-        """Try a population, one episode each, and fit the next one to its elite."""
-        self.pulse("trying policies", 0.0)
-        stream = self.streams.generator("population", environment.iteration)
-        noise = stream.standard_normal((self.settings.population, *self.mean.shape))
-        gains = self.mean + self.std * noise
-        episodes = environment.collect(LinearPolicy(gains), len(gains))
-        elite = gains[np.argsort(episodes.costs.sum(axis=1))[: self.settings.elite]]
-        self.mean, self.std = elite.mean(axis=0), elite.std(axis=0)
-        return {"spread": float(self.std.mean())}
+        """Try a population, one episode each; costs count by their rank, so no scale matters."""
+        self.pulse("trying changes", 0.0)
+        stream = self.streams.generator("changes", environment.iteration)
+        changes = stream.standard_normal((self.settings.population, *self.gains.shape))
+        tried = LinearPolicy(self.gains + self.settings.spread * changes)
+        episodes = environment.collect(tried, len(changes))
+        ranks = episodes.costs.sum(axis=1).argsort().argsort()
+        score = (ranks - ranks.mean()) / ranks.std()
+        step = np.einsum("n,nak->ak", score, changes) / len(changes)
+        self.gains = self.gains - self.settings.rate * self.settings.spread * step
+        return {"step": float(np.linalg.norm(step))}
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the next iteration depends on."""
-        return {"mean": self.mean.tolist(), "std": self.std.tolist()}
+        return {"gains": self.gains.tolist()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take up a saved state."""
-        self.mean, self.std = np.array(state["mean"]), np.array(state["std"])
+        self.gains = np.array(state["gains"])
 
     def diagnose(self, evaluation: Evaluation) -> dict[str, float]:
         """It has no representation to judge."""

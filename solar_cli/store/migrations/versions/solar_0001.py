@@ -19,7 +19,7 @@ def upgrade() -> None:
         sa.Column("method", TEXT, nullable=False),
         sa.Column("variant", TEXT, nullable=False),
         sa.Column("seed", sa.BigInteger, nullable=False),
-        sa.Column("configuration", sa.JSON, nullable=False),
+        sa.Column("configuration", TEXT, nullable=False),
         sa.Column("created", MOMENT, nullable=False),
         sa.Column("iteration", sa.BigInteger, nullable=False),
         sa.Column("episodes", sa.BigInteger, nullable=False),

@@ -1,0 +1,178 @@
+"""The command as a whole: fast, documented, one way of failing."""
+
+import os
+import re
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from scenario import Solar, Stored
+
+from solar_cli import cli
+from solar_cli.errors import SolarError
+
+README = Path(__file__).parent.parent.parent / "README.md"
+HEAVY = ("torch", "scipy", "matplotlib", "pandas", "gymnasium")
+COMMANDS = sorted(command.name for command in cli.app.registered_commands if command.name)
+
+
+def test_the_commands_are_those_of_the_design() -> None:
+    named = {"run", "status", "show", "report", "compare", "tasks", "methods", "export", "rm"}
+    assert set(COMMANDS) == named | {"doctor"}
+
+
+def examples(text: str) -> list[str]:
+    return re.findall(r"^ +(solar [a-z]+.*?) *$", text, re.MULTILINE)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help_with_an_example_that_parses(solar: Solar, command: str) -> None:
+    done = solar(command, "--help")
+    assert done.code == 0
+    assert "--db" in done.out
+    assert "Example:" in done.out
+    [example] = examples(done.out)
+    assert example.split()[:2] == ["solar", command]
+    # parsed and understood as far as a database that does not exist
+    failed = solar(*example.split()[1:], "--db", "absent/dir/none.db", "--help")
+    assert failed.code == 0
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_is_in_the_readme(command: str) -> None:
+    assert re.search(rf"^solar {command}\b", README.read_text(), re.MULTILINE)
+
+
+def test_every_command_of_the_readme_exists_with_its_options(solar: Solar) -> None:
+    text = README.read_text()
+    found = re.findall(r"^solar ([a-z]+)(.*?)(?:#.*)?$", text, re.MULTILINE)
+    assert len(found) >= len(COMMANDS)
+    for command, rest in found:
+        assert command in COMMANDS
+        help_text = solar(command, "--help").out
+        for option in re.findall(r"--[a-z-]+", rest):
+            assert option in help_text, f"solar {command} {option}"
+
+
+def run_python(program: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", program],
+        capture_output=True,
+        text=True,
+        env={**os.environ, **environment},
+        check=False,
+    )
+
+
+def imported(arguments: list[str], folder: Path) -> set[str]:
+    """Heavy modules that a command has imported when it is done."""
+    program = (
+        "import os, sys; from solar_cli.cli import main;"
+        f"os.chdir({str(folder)!r}); code = main({arguments!r});"
+        f"print('HEAVY', code, *[name for name in {(*HEAVY, 'sqlalchemy')} if name in sys.modules])"
+    )
+    done = run_python(program)
+    last = done.stdout.splitlines()[-1].split()
+    assert last[:2] == ["HEAVY", "0"], done
+    return set(last[2:])
+
+
+def test_help_imports_nothing_heavy(tmp_path: Path) -> None:
+    assert imported(["--help"], tmp_path) == set()
+    assert imported(["run", "--help"], tmp_path) == set()
+    assert imported(["tasks"], tmp_path) == set()
+    assert imported(["methods", "solar"], tmp_path) == set()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["status"],
+        ["show", "{cell}"],
+        ["run", "--task", "nav", "--method", "solar", "--variant", "smoke", "--seeds", "3"],
+        ["run", "--task", "nav", "--method", "solar", "--seeds", "9", "--dry-run"],
+        ["run", "--task", "nav", "--method", "solar", "--variant", "smoke", "--device", "cuda"],
+    ],
+    ids=lambda arguments: " ".join(arguments[:1] + arguments[-1:]),
+)
+def test_looking_at_a_matrix_imports_nothing_heavy(
+    stored: Stored, tmp_path: Path, arguments: list[str]
+) -> None:
+    """The last case: no GPU is looked for where nothing is left to compute."""
+    told = [argument.format(cell=stored.finished.hash) for argument in arguments]
+    assert imported([*told, "--db", str(stored.db)], tmp_path) == {"sqlalchemy"}
+
+
+def test_help_is_there_at_once() -> None:
+    """Processor time, because that of the clock depends on who else is computing."""
+
+    def seconds() -> float:
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        assert run_python("from solar_cli.cli import main; main(['--help'])").returncode == 0
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+    assert min(seconds() for _ in range(3)) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (SolarError("it broke [red]\x1b[1m\nhere"), 1, "solar: it broke [red][1m here\n"),
+        (KeyboardInterrupt(), 130, ""),
+    ],
+)
+def test_an_error_is_one_line_and_its_exit_code(
+    solar: Solar, monkeypatch: pytest.MonkeyPatch, error: BaseException, code: int, said: str
+) -> None:
+    from solar_cli import settings
+
+    def fail() -> list[str]:
+        raise error
+
+    monkeypatch.setattr(settings, "card_names", fail)
+    done = solar("tasks")
+    assert (done.code, done.err) == (code, said)
+
+
+@pytest.mark.parametrize("command", ["methods --json", "tasks nav"])
+def test_a_reader_that_leaves_early_is_met_with_silence(command: str) -> None:
+    """Both ends: output that waits for the last flush, and output that is written before it."""
+    program = "import sys; from solar_cli.cli import main; sys.exit(main())"
+    pipeline = f'"$0" -c "$1" {command} | true; exit ${{PIPESTATUS[0]}}'
+    done = subprocess.run(
+        ["bash", "-c", pipeline, sys.executable, program],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"},
+    )
+    assert (done.returncode, done.stderr) == (1, "")
+
+
+def complete(line: str) -> str:
+    """What bash would offer for a command line; its last word is being typed."""
+    program = "import sys; from solar_cli.cli import main; sys.exit(main([]))"
+    environment = {
+        "_SOLAR_COMPLETE": "complete_bash",
+        "COMP_WORDS": line,
+        "COMP_CWORD": str(len(line.split(" ")) - 1),
+    }
+    return run_python(program, **environment).stdout
+
+
+@pytest.mark.parametrize(
+    ("line", "offered"),
+    [
+        ("solar run --task na", {"nav", "nav-fixed"}),
+        ("solar run --task nav --method so", {"solar"}),
+        ("solar status --variant sm", {"smoke"}),
+        ("solar tasks nav-", {"nav-fixed"}),
+    ],
+)
+def test_the_shell_completes_names_of_tasks_methods_and_variants(
+    line: str, offered: set[str]
+) -> None:
+    assert set(complete(line).split()) == offered

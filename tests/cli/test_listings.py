@@ -1,0 +1,241 @@
+"""Listings and exports: what is printed, in which form, and that it is inert."""
+
+import csv
+import io
+import json
+from pathlib import Path
+
+import pytest
+from scenario import Done, Solar, Stored
+
+CONTROLS = ("\x1b", "\x07", "\r")
+
+
+def inert(done: Done) -> None:
+    """No stored text reaches the terminal as a command or as markup."""
+    assert not any(control in done.out + done.err for control in CONTROLS)
+
+
+def test_status_shows_the_state_of_every_cell(solar: Solar, stored: Stored) -> None:
+    done = solar("status", "--db", stored.db)
+    assert done.code == 0
+    inert(done)
+    lines = {line.split()[0]: line for line in done.out.splitlines() if line.strip()}
+    for state in ("finished", "stale", "diverged", "failed", "interrupted", "pending"):
+        assert state in lines[getattr(stored, state).hash[:8]]
+    assert "final_distance 0.04" in lines[stored.finished.hash[:8]]
+    assert "NaN in the ELBO" in lines[stored.diverged.hash[:8]]
+    assert "[bold]not bold[/bold]" in done.out  # shown as it is, not as markup
+    assert (
+        "7 cells: 1 diverged, 1 failed, 2 finished, 1 interrupted, 1 pending, 1 stale" in done.out
+    )
+
+
+def test_status_as_json_has_the_same_facts(solar: Solar, stored: Stored) -> None:
+    entries = json.loads(solar("status", "--json", "--db", stored.db).out)
+    assert len(entries) == 7
+    first = next(entry for entry in entries if entry["cell"] == stored.finished.hash)
+    assert (first["task"], first["method"], first["variant"]) == ("nav", "solar", "smoke")
+    assert (first["state"], first["stale"], first["episodes"]) == ("finished", False, 16)
+    assert first["value"] == pytest.approx(0.04)
+    diverged = next(entry for entry in entries if entry["cell"] == stored.diverged.hash)
+    assert diverged["value"] is None  # JSON has no nan
+
+
+@pytest.mark.parametrize(
+    ("options", "count"),
+    [
+        ((), 7),
+        (("--task", "nav"), 7),
+        (("--task", "nav-fixed"), 0),
+        (("--method", "vae"), 2),
+        (("--method", "vae", "--method", "solar"), 7),
+        (("--variant", "smoke"), 6),
+        (("--variant", "smoke", "--method", "solar"), 4),
+    ],
+)
+def test_filters_narrow_a_listing(
+    solar: Solar, stored: Stored, options: tuple[str, ...], count: int
+) -> None:
+    assert len(json.loads(solar("status", *options, "--json", "--db", stored.db).out)) == count
+
+
+def test_a_listing_without_cells_says_how_to_start(solar: Solar, stored: Stored) -> None:
+    done = solar("status", "--task", "nav-fixed", "--db", stored.db)
+    assert (done.code, "solar run" in done.out) == (0, True)
+
+
+def test_watching_ends_when_nothing_runs(solar: Solar, stored: Stored) -> None:
+    assert solar("status", "--watch", "--db", stored.db).code == 0
+
+
+def test_show_prints_curve_changes_attempts_and_log(solar: Solar, stored: Stored) -> None:
+    done = solar("show", stored.finished.hash[:6], "--db", stored.db)
+    assert done.code == 0
+    inert(done)
+    for part in (
+        stored.finished.hash,
+        "nav/solar:smoke seed 0",
+        "finished: iteration 2, 16 episodes of 16",
+        "final_distance in world units",
+        "lower is better",
+        "1 │",  # the curve's highest label
+        "0.04 │",
+        "methods.solar.training.steps",
+        "variant smoke",
+        "task.observation.height",
+        "card",
+        "Attempts",
+        "last",
+    ):
+        assert part in done.out, part
+    assert "task.step_seconds" not in done.out  # it is as the default
+    assert done.out.count("first") == 14  # the log's end only
+
+
+def test_show_as_json_holds_the_whole_configuration(solar: Solar, stored: Stored) -> None:
+    entry = json.loads(solar("show", stored.finished.hash, "--json", "--db", stored.db).out)
+    assert entry["configuration"] == json.loads(json.dumps(stored.finished.config()))
+    assert entry["curve"] == [[0, 1.0], [8, 0.5], [16, 0.04]]
+    assert [attempt["outcome"] for attempt in entry["attempts"]] == ["finished"]
+
+
+@pytest.mark.parametrize("name", ["pending", "failed", "diverged", "interrupted"])
+def test_show_works_for_a_cell_in_any_state(solar: Solar, stored: Stored, name: str) -> None:
+    done = solar("show", getattr(stored, name).hash, "--db", stored.db)
+    assert (done.code, done.err) == (0, "")
+    inert(done)
+
+
+def test_export_has_one_row_a_metric_in_every_format(
+    solar: Solar, stored: Stored, tmp_path: Path
+) -> None:
+    pandas = pytest.importorskip("pandas")
+    text = solar("export", "--db", stored.db).out
+    rows = list(csv.DictReader(io.StringIO(text)))
+    assert list(rows[0]) == [
+        *("cell", "task", "method", "variant", "seed", "iteration", "episodes", "steps"),
+        *("split", "name", "value", "kind"),
+    ]
+    assert len(rows) == 3 * (3 + 3 + 3 + 2 + 2 + 1)
+    assert {row["kind"] for row in rows} == {"finite", "nan", "-inf"}
+
+    entries = json.loads(solar("export", "--format", "json", "--db", stored.db).out)
+    assert len(entries) == len(rows)
+    assert all((entry["value"] is None) == (entry["kind"] != "finite") for entry in entries)
+
+    pytest.importorskip("pyarrow")
+    path = tmp_path / "metrics.parquet"
+    done = solar("export", "--format", "parquet", "--output", path, "--db", stored.db)
+    assert (done.code, done.out) == (0, "")
+    frame = pandas.read_parquet(path)
+    assert len(frame) == len(rows)
+    assert frame["value"].isna().sum() == 2  # the return and the distance of the diverged cell
+
+
+def test_export_of_one_method_has_its_rows_only(solar: Solar, stored: Stored) -> None:
+    text = solar("export", "--method", "vae", "--db", stored.db).out
+    rows = list(csv.DictReader(io.StringIO(text)))
+    assert {row["method"] for row in rows} == {"vae"}
+
+
+def test_rm_asks_first_and_keeps_everything_without_a_yes(
+    solar: Solar, stored: Stored, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for answer in ("n\n", "\n", ""):
+        monkeypatch.setattr("sys.stdin", io.StringIO(answer))
+        done = solar("rm", stored.finished.hash, "--db", stored.db)
+        assert done.code == 1
+        assert "nothing was done" in done.err
+    assert len(json.loads(solar("status", "--json", "--db", stored.db).out)) == 7
+
+
+def test_rm_removes_what_is_named_with_its_files(
+    solar: Solar, stored: Stored, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = stored.db.parent / "cells" / stored.finished.hash
+    assert folder.is_dir()
+    monkeypatch.setattr("sys.stdin", io.StringIO("y\n"))
+    assert solar("rm", stored.finished.hash[:8], "--db", stored.db).code == 0
+    assert not folder.exists()
+    done = solar("rm", "--method", "vae", "--yes", "--db", stored.db)
+    assert (done.code, "removed 2" in done.out) == (0, True)
+    left = {e["cell"] for e in json.loads(solar("status", "--json", "--db", stored.db).out)}
+    assert left == {
+        cell.hash for cell in (stored.second, stored.stale, stored.interrupted, stored.pending)
+    }
+
+
+def test_tasks_lists_the_cards_and_resolves_one(solar: Solar) -> None:
+    names = [entry["task"] for entry in json.loads(solar("tasks", "--json").out)]
+    assert {"nav", "nav-fixed"} <= set(names)
+    command = ("tasks", "nav", "--variant", "smoke", "--set", "task.action.bound=2.0", "--json")
+    lines = {line["path"]: line for line in json.loads(solar(*command).out)}
+    origins = {
+        "task.horizon": "variant smoke",
+        "task.observation.height": "card",
+        "task.action.bound": "--set",
+        "task.step_seconds": "default",
+        "methods.solar.training.steps": "variant smoke",
+        "methods.solar.training.clip": "default",
+    }
+    assert {path: lines[path]["origin"] for path in origins} == origins
+    assert lines["task.action.bound"]["value"] == 2.0
+    assert lines["methods.solar.batches.initial"]["source"] == "App. D"
+    assert all(line["description"] for line in lines.values())
+    assert "methods.solar.training.steps" in solar("tasks", "nav").out
+    assert "methods.vae.local_fit.method" in solar("tasks", "nav", "--method", "vae").out
+
+
+def test_methods_lists_the_methods_and_the_settings_of_one(solar: Solar) -> None:
+    entries = {entry["name"]: entry for entry in json.loads(solar("methods", "--json").out)}
+    assert {"solar", "vae"} <= set(entries)
+    lines = {line["path"]: line for line in json.loads(solar("methods", "solar", "--json").out)}
+    assert lines["methods.solar.batches.initial"]["origin"] == "set by the card"
+    assert lines["methods.solar.update.kl_step"]["origin"] == "default"
+    assert "KL-constrained" in solar("methods").out
+
+
+def test_every_setting_of_a_card_can_be_set_by_the_path_that_tasks_prints(solar: Solar) -> None:
+    """The first column of ``solar tasks NAME`` is what ``--set`` takes."""
+    from solar_cli.cli.configuration import shown
+    from solar_cli.settings import load_card, resolve
+
+    lines = json.loads(solar("tasks", "nav", "--json").out)
+    sets = [f"{line['path']}={shown(line['value'])}" for line in lines]
+    card = load_card("nav")
+    again = resolve(card, "solar", "default", sets)
+    assert again.configuration == resolve(card, "solar").configuration
+
+
+def test_compare_and_report_print_what_they_found(
+    solar: Solar, stored: Stored, tmp_path: Path
+) -> None:
+    done = solar("compare", "vae:smoke", "solar:smoke", "--db", stored.db)
+    assert done.code == 0, done
+    assert "vae:smoke" in done.out
+    for format, mark in (("markdown", "|---|"), ("latex", "tabular"), ("json", '"verdict"')):
+        out = solar(
+            "compare", "vae:smoke", "solar:smoke", "--format", format, "--db", stored.db
+        ).out
+        assert mark in out
+    json.loads(solar("compare", "vae:smoke", "solar:smoke", "--json", "--db", stored.db).out)
+
+    out = tmp_path / "out"
+    done = solar("report", "--out", out, "--db", stored.db)
+    assert done.code == 0, done
+    assert "final_distance" in done.out
+    assert f"page: {out / 'index.html'}" in done.out
+    [curve] = out.rglob("curve.png")
+    assert f"curve: {curve}" in done.out
+
+
+def test_doctor_finds_this_machine_in_order(solar: Solar, stored: Stored, tmp_path: Path) -> None:
+    checks = {check["name"]: check for check in json.loads(solar("doctor", "--json").out)}
+    assert {"Python", "Solar", "packages", "torch", "database", "disk", "GL"} <= set(checks)
+    done = solar("doctor", "--db", stored.db)
+    assert done.code == 0, done
+    assert "delete" in done.out  # the journal mode
+    (tmp_path / "notes.txt").write_text("my notes\n" * 100)
+    done = solar("doctor", "--db", tmp_path / "notes.txt")
+    assert (done.code, "bad" in done.out) == (1, True)

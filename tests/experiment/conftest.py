@@ -1,0 +1,57 @@
+"""The fake method, registered as any other package's would be; cells and attempts of it."""
+
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from solar_cli.settings import Cell, cells, load_card, registry
+from solar_cli.store.store import Store
+
+HERE = Path(__file__).parent
+
+
+@pytest.fixture(scope="session", autouse=True)
+def fake_package(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Installs the fake method; the value of PYTHONPATH with which workers find it too."""
+    torch.set_num_threads(1)  # as in a worker
+    site = tmp_path_factory.mktemp("site")
+    metadata = site / "fake_method-0.1.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: fake-method\nVersion: 0.1\n")
+    (metadata / "entry_points.txt").write_text("[solar.methods]\nfake = fake_method:ENTRY\n")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(HERE))
+        patch.syspath_prepend(str(site))
+        path = f"{site}:{HERE}"
+        patch.setenv("PYTHONPATH", path)
+        registry._known.cache_clear()
+        yield path
+    registry._known.cache_clear()
+    sys.modules.pop("fake_method", None)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    with Store.open(str(tmp_path / "solar.db")) as store:
+        yield store
+
+
+MakeCells = Callable[..., list[Cell]]
+
+
+@pytest.fixture
+def make_cells() -> MakeCells:
+    """Cells of nav's smoke variant; keywords are settings of the fake method."""
+
+    def make(seeds: int = 1, method: str = "fake", **settings: Any) -> list[Cell]:
+        sets = [
+            f"methods.{method}.{name}={f'{value!r}' if isinstance(value, str) else value}"
+            for name, value in settings.items()
+        ]
+        return cells(load_card("nav"), method, range(seeds), "smoke", sets)
+
+    return make

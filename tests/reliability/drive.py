@@ -1,0 +1,39 @@
+"""``solar run`` on the smoke variant, with a worker that can be told to die.
+
+python drive.py DATABASE SEEDS CHECKPOINT_SECONDS RESULTS.json [PATH=VALUE]...
+"""
+
+import json
+import os
+import sys
+from pathlib import Path
+
+from solar_cli.experiment.engine import LocalEngine
+from solar_cli.experiment.matrix import plan
+from solar_cli.experiment.scheduler import run
+from solar_cli.settings import cells, load_card
+from solar_cli.store.store import Store
+
+# The encoder moves in every iteration, so that each has pulses and an update that depends on it.
+SETS = ["methods.solar.training.steps=60", "methods.solar.training.fine_tune_steps=40"]
+TARGET = 16  # three iterations
+
+database, seeds, checkpoint_seconds, out, *sets = sys.argv[1:]
+worker = Path(__file__).parent / "mortal_worker.py"
+engine = LocalEngine([sys.executable, str(worker)]) if os.environ["DIE"] else LocalEngine()
+wanted = cells(load_card("nav"), "solar", range(int(seeds)), "smoke", [*SETS, *sets], "kills")
+with Store.open(database) as store:
+    results = run(
+        plan(store, wanted, TARGET),
+        store,
+        engine=engine,
+        workers=2,
+        device="cpu",
+        checkpoint_seconds=float(checkpoint_seconds),
+    )
+summary = [
+    {"cell": result.plan.cell.hash, "finished": result.finished, "cause": result.cause}
+    for result in results
+]
+Path(out).write_text(json.dumps(summary))
+sys.exit(not all(result.finished for result in results))

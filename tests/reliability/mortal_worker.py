@@ -1,0 +1,79 @@
+"""The worker, but it kills with -9 at a moment that ``DIE`` names: ``MOMENT:NTH:WHO``.
+
+The moment counts from the start of the process; who is ``worker``, ``scheduler`` or ``both``.
+"""
+
+import os
+import signal
+import sys
+from collections.abc import Callable
+from typing import Any
+
+from solar_cli.envs.task import RowTask
+from solar_cli.episodes import Environment
+from solar_cli.experiment import checkpointing, session, worker
+from solar_cli.experiment.judge import Judge
+from solar_cli.methods.local import LocalLearner
+from solar_cli.store.store import Store
+
+moment, nth, who = os.environ["DIE"].split(":")
+count = 0
+
+
+def strike() -> None:
+    """Kill, at the nth call."""
+    global count
+    count += 1
+    if count != int(nth):
+        return
+    with open(os.environ["KILLS"], "a") as kills:
+        kills.write(f"{moment}:{nth}:{who}\n")
+        kills.flush()
+    if who in ("scheduler", "both"):
+        os.kill(os.getppid(), signal.SIGKILL)
+    if who in ("worker", "both"):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def after(owner: Any, name: str) -> None:
+    """Strike when ``owner.name`` has returned."""
+    whole = getattr(owner, name)
+
+    def wrapped(*args: Any, **kwargs: Any) -> Any:
+        result = whole(*args, **kwargs)
+        strike()
+        return result
+
+    setattr(owner, name, wrapped)
+
+
+def inside_evaluation() -> None:
+    """Strike at steps of a simulator that a judge runs."""
+    whole: Callable[..., Any] = Judge.evaluate
+
+    def evaluate(self: Judge, *args: Any) -> Any:
+        step = RowTask.step
+
+        def striking(task: RowTask, actions: Any) -> Any:
+            strike()
+            return step(task, actions)
+
+        RowTask.step = striking  # type: ignore[method-assign]
+        try:
+            return whole(self, *args)
+        finally:
+            RowTask.step = step  # type: ignore[method-assign]
+
+    Judge.evaluate = evaluate  # type: ignore[method-assign]
+
+
+MOMENTS: dict[str, Callable[[], None]] = {
+    "collected": lambda: after(Environment, "collect"),
+    "training": lambda: after(session.Session, "_pulse"),
+    "updated": lambda: after(LocalLearner, "adopted"),  # a new policy, the iteration not done
+    "evaluating": inside_evaluation,
+    "renamed": lambda: after(checkpointing, "save"),  # the file is there, its row is not
+    "committed": lambda: after(Store, "commit"),
+}
+MOMENTS[moment]()
+sys.exit(worker.main())
