@@ -85,8 +85,9 @@ def command(
 ) -> None:
     """Compute every task x method x seed that is not finished; resume what was interrupted.
 
-    Finished cells are skipped, or continued where more episodes are asked for. Ctrl-C saves and
-    stops; the same command goes on from there.
+    Finished cells are skipped, or continued where more episodes are asked for.
+
+    Ctrl-C saves and stops; the same command goes on from there.
 
     \b
     Example:

@@ -119,7 +119,7 @@ class Session:
         self._iterating = True
         try:
             learned = self.learner.iterate(self.environment)
-        except (np.linalg.LinAlgError, torch.linalg.LinAlgError) as error:
+        except (np.linalg.LinAlgError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
             # What numbers that are no longer finite look like to a factorisation.
             raise Diverged(str(error)) from error
         self._iterating = False

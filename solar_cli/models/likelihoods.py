@@ -28,8 +28,8 @@ def pyramid_error(residual: Float[Tensor, n * frame]) -> Float[Tensor, ""]:
 
 
 def calibrated(
-    outputs: Float[Tensor, "n *frame"],
-    frames: Float[Tensor, "n *frame"],
+    outputs: Float[Tensor, n *frame],
+    frames: Float[Tensor, n *frame],
     nats: float,
     pyramid: bool,
 ) -> Float[Tensor, ""]:

@@ -14,6 +14,8 @@ from solar_cli.reporting.tables import number
 from solar_cli.store.store import Store
 
 SPLITS = ("train", "model")
+HEALTHY = "healthy"
+"""Metric of a method that judges its own representation: 1, or 0 for a dead or collapsed one."""
 SPARK_WIDTH, SPARK_HEIGHT = 100, 20
 
 
@@ -42,6 +44,16 @@ class Chart:
     labels: tuple[str, ...]
     rows: tuple[tuple[str, tuple[Vital | None, ...]], ...]
     """name of the metric and one entry a curve, None where the method has no such metric"""
+
+    @property
+    def warnings(self) -> list[str]:
+        """One line for each curve with a seed whose method calls its representation unhealthy."""
+        verdicts = dict(self.rows).get(HEALTHY, ())
+        return [
+            f"{label}: the representation of at least one seed is not healthy"
+            for label, vital in zip(self.labels, verdicts, strict=False)
+            if vital is not None and not vital.low >= 1
+        ]
 
 
 def chart(store: Store, curves: Sequence[Curve]) -> Chart:

@@ -33,6 +33,9 @@ def page(
         cells=cells,
         failed=[line for line in cells if line.failed],
         stale=[line for line in cells if line.stale],
+        warnings=[
+            f"{part.problem.title}: {line}" for part in sections for line in part.health.warnings
+        ],
         origins=origins,
         origin_columns=ORIGIN_COLUMNS,
         made_by=made_by,

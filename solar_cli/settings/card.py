@@ -182,8 +182,12 @@ def _check_methods(layer: Table, origin: str, card: Card) -> None:
                 f"{origin} of task {card.name!r}: unknown path {key!r}: "
                 "a path starts with task, evaluation or methods"
             )
+    if not isinstance(named := layer.get("methods", {}), dict):
+        raise UsageError(
+            f"{origin} of task {card.name!r}: 'methods' takes no value: say methods.NAME.SETTING"
+        )
     if origin == "--set":
-        for name in layer.get("methods", {}):
+        for name in named:
             method(name)
 
 
@@ -195,7 +199,7 @@ def assignment(text: str) -> Table:
     try:
         parsed = tomllib.loads(f"value = {value}")
         tree: Any = parsed.pop("value")
-    except (tomllib.TOMLDecodeError, KeyError) as error:
+    except (ValueError, KeyError, RecursionError) as error:  # a number or a nesting without end
         raise UsageError(
             f"--set {text!r}: {value!r} is not a TOML value (text needs quotes): {error}"
         ) from error

@@ -16,6 +16,9 @@ from solar_cli.settings.registry import method, settings_class
 from solar_cli.settings.schema import hashed_values
 from solar_cli.settings.task import EvaluationSettings, TaskSettings
 
+MOST_SEEDS = 10_000
+"""of one run: beyond any experiment, and a slip of the pen must not fill the memory"""
+
 
 @dataclass(frozen=True)
 class Cell:
@@ -88,9 +91,10 @@ def cells(
     sets: Sequence[str] = (),
     label: str | None = None,
 ) -> list[Cell]:
-    """The cells of one task and method, one a seed."""
+    """The cells of one task and method, one a seed; a change of another method changes nothing."""
     configuration = resolve(card, method_name, variant, sets).configuration
-    name = variant_name(variant, sets, label)
+    own = [text for text in sets if _concerns(text, method_name)]
+    name = variant_name(variant, own, label if own or not sets else None)
     return [Cell(card.name, method_name, name, seed, configuration) for seed in seeds]
 
 
@@ -108,9 +112,21 @@ def variant_name(variant: str, sets: Sequence[str], label: str | None) -> str:
     changes = []
     for text in sorted(sets):
         path, _, value = text.partition("=")
-        key = path.split(".")[-1].strip()
-        changes.append(f"{key}-{re.sub('[^a-z0-9.]+', '-', value.lower()).strip('-')}")
+        # The whole path but for where it starts: two settings of one name are two variants.
+        key = re.sub(r"^\s*(task|methods\.[^.]+)\.", "", path)
+        changes.append("-".join(_plain(part) for part in (key, value)))
     return "_".join([variant] * (variant != "default") + changes)
+
+
+def _plain(text: str) -> str:
+    """In the letters that a name may have; a minus stays, as 1 and -1 differ."""
+    return re.sub("[^a-z0-9.-]+", "_", text.lower()).strip("_")
+
+
+def _concerns(text: str, method_name: str) -> bool:
+    """Whether a ``--set`` can change this method's cells."""
+    first, _, rest = text.partition("=")[0].partition(".")
+    return first.strip() != "methods" or rest.partition(".")[0].strip() == method_name
 
 
 def parse_seeds(text: str) -> list[int]:
@@ -118,15 +134,17 @@ def parse_seeds(text: str) -> list[int]:
     try:
         if ":" in text:
             first, last = (int(part) for part in text.split(":"))
-            seeds = list(range(first, last))
+            seeds = list(range(first, min(last, first + MOST_SEEDS + 1)))
         elif "," in text:
             seeds = [int(part) for part in text.split(",") if part.strip()]
         else:
-            seeds = list(range(int(text)))
+            seeds = list(range(min(int(text), MOST_SEEDS + 1)))
     except ValueError as error:
         raise UsageError(
             f"--seeds {text!r}: expected a number of seeds (3), a list (3,5,8) or a range (0:10)"
         ) from error
+    if len(seeds) > MOST_SEEDS:
+        raise UsageError(f"--seeds {text!r}: expected at most {MOST_SEEDS} seeds")
     if not seeds or min(seeds) < 0 or len(set(seeds)) < len(seeds) or max(seeds) >= 2**31:
         raise UsageError(f"--seeds {text!r}: expected at least one seed, each once, from 0 up")
     return seeds

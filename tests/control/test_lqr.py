@@ -275,7 +275,7 @@ def test_an_indefinite_cost_limits_the_step_and_is_said():
 def test_when_no_step_is_possible_the_previous_policy_comes_back(
     max_kl, change, outcome, std_bounds
 ):
-    policy, dynamics, cost = random_problem(12)
+    policy, dynamics, cost = random_problem(12, a=3)
     cost = cost._replace(C=change(cost.C))
     update = improve_policy(policy, dynamics, cost, max_kl, std_bounds)
     assert update.outcome is outcome

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from conftest import Matrix, Undisturbed
+from disturbed import Matrix, Undisturbed
 
 from solar_cli.store.store import Store
 

@@ -3,7 +3,7 @@
 import random
 from collections.abc import Callable
 
-from conftest import Matrix, Undisturbed
+from disturbed import Matrix, Undisturbed
 
 KILLS = 10
 

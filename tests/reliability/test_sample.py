@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from conftest import Matrix, Undisturbed
+from disturbed import Matrix, Undisturbed
 
 KILLS = (  # in iteration 1, ...
     "training:1:worker",

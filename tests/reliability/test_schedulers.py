@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from conftest import Matrix, Undisturbed
+from disturbed import Matrix, Undisturbed
 
 from solar_cli.store.records import State
 from solar_cli.store.store import Store

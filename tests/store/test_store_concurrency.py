@@ -2,6 +2,7 @@
 
 import multiprocessing
 import sqlite3
+import time
 from collections import Counter
 from collections.abc import Callable
 from multiprocessing.synchronize import Barrier
@@ -30,7 +31,7 @@ def together(work: Callable[..., Any], *arguments: tuple[Any, ...]) -> list[Any]
     barrier = processes.Barrier(len(arguments))
     answers = processes.SimpleQueue()
     started = [
-        processes.Process(target=_answer, args=(work, answers, barrier, *each))
+        processes.Process(target=_answer, args=(work, answers, barrier, *each), daemon=True)
         for each in arguments
     ]
     for process in started:
@@ -75,11 +76,13 @@ def read(barrier: Barrier, address: str) -> int:
     torn = 0
     with Store.open(address, read_only=True) as store:
         barrier.wait()
-        while True:
+        for _ in range(600):
             rows = Counter((row["cell"], row["iteration"]) for row in store.metrics())
             torn += sum(count != METRICS for count in rows.values())
             if len(rows) == WRITERS * ITERATIONS:
                 return torn
+            time.sleep(0.1)
+    raise TimeoutError("the writers did not write all")
 
 
 def test_eight_writers_and_a_reader_lose_nothing_and_see_no_half_iteration(tmp_path: Path) -> None:
