@@ -82,12 +82,12 @@ class FrameModel(nn.Module):
         elif self.observation.kind == "image":
             self.frame_scale.fill_(255.0)
 
-    def scaled(self, frames: Tensor) -> Float[Tensor, n * frame]:
+    def scaled(self, frames: Tensor) -> Float[Tensor, "n *frame"]:
         """Frames as the networks see them."""
         return (frames.float() - self.frame_mean) / self.frame_scale
 
     def encode(
-        self, scaled: Float[Tensor, n * frame]
+        self, scaled: Float[Tensor, "n *frame"]
     ) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d"]]:
         """Mean and variance of q(z | s)."""
         features = self.body(scaled)
@@ -98,7 +98,7 @@ class FrameModel(nn.Module):
         return mean, self.log_variance(features).clamp(*LOG_VARIANCE_RANGE).exp()
 
     def reconstruction_loss(
-        self, latents: Float[Tensor, "n d"], scaled: Float[Tensor, n * frame]
+        self, latents: Float[Tensor, "n d"], scaled: Float[Tensor, "n *frame"]
     ) -> Float[Tensor, ""]:
         """Negative log-likelihood of frames, nats a frame up to a constant."""
         outputs, settings = self.decoder(latents), self.settings
@@ -106,11 +106,11 @@ class FrameModel(nn.Module):
             return calibrated(outputs, scaled, settings.nats, settings.pyramid)
         return UNCALIBRATED[settings.likelihood](outputs, scaled)
 
-    def reconstruct(self, scaled: Float[Tensor, n * frame]) -> Float[Tensor, n * frame]:
+    def reconstruct(self, scaled: Float[Tensor, "n *frame"]) -> Float[Tensor, "n *frame"]:
         """The expected frame for the encoder's mean, as scaled frames."""
         return mean_frame(self.decoder(self.encode(scaled)[0]), scaled, self.settings.likelihood)
 
-    def as_frames(self, scaled: Float[Tensor, n * frame]) -> Tensor:
+    def as_frames(self, scaled: Float[Tensor, "n *frame"]) -> Tensor:
         """Scaled frames in stored units."""
         frames = scaled * self.frame_scale + self.frame_mean
         if self.observation.kind == "image":

@@ -17,7 +17,7 @@ PYRAMID = ((4, 16.0), (8, 64.0))
 """Side and weight of the pooled residuals: they make small things that are misplaced count."""
 
 
-def pyramid_error(residual: Float[Tensor, n * frame]) -> Float[Tensor, ""]:
+def pyramid_error(residual: Float[Tensor, "n *frame"]) -> Float[Tensor, ""]:
     """Mean squared residual, with that of its pooled versions for images that are large enough."""
     error = residual.square().mean()
     if residual.ndim == 4:
@@ -28,8 +28,8 @@ def pyramid_error(residual: Float[Tensor, n * frame]) -> Float[Tensor, ""]:
 
 
 def calibrated(
-    outputs: Float[Tensor, n *frame],
-    frames: Float[Tensor, n *frame],
+    outputs: Float[Tensor, "n *frame"],
+    frames: Float[Tensor, "n *frame"],
     nats: float,
     pyramid: bool,
 ) -> Float[Tensor, ""]:
@@ -42,12 +42,12 @@ def calibrated(
     return nats * error.log()
 
 
-def gaussian(outputs: Float[Tensor, n * frame], frames: Float[Tensor, n * frame]) -> Tensor:
+def gaussian(outputs: Float[Tensor, "n *frame"], frames: Float[Tensor, "n *frame"]) -> Tensor:
     """A Gaussian of unit variance."""
     return 0.5 * (outputs - frames).square().flatten(1).sum(dim=1).mean()
 
 
-def bernoulli(outputs: Float[Tensor, n * frame], frames: Float[Tensor, n * frame]) -> Tensor:
+def bernoulli(outputs: Float[Tensor, "n *frame"], frames: Float[Tensor, "n *frame"]) -> Tensor:
     """Independent Bernoulli pixels; outputs are logits, frames lie in [0, 1]."""
     loss = functional.binary_cross_entropy_with_logits(outputs, frames, reduction="none")
     return loss.flatten(1).sum(dim=1).mean()
@@ -80,7 +80,7 @@ UNCALIBRATED: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 
 
 def explained_variance(
-    expected: Float[Tensor, n * frame], frames: Float[Tensor, n * frame]
+    expected: Float[Tensor, "n *frame"], frames: Float[Tensor, "n *frame"]
 ) -> Float[Tensor, " c"]:
     """Share of each channel's (each entry's) variance over frames that the model explains."""
     axes = (0, *range(2, frames.ndim))

@@ -23,8 +23,8 @@ from solar_cli.settings.networks import (
 Shape = tuple[int, ...]
 
 LOG_SPEED = 5.0
-"""Adam moves a parameter by at most its learning rate a step: too little for the log of a width or
-of a temperature, which has to change by whole units within a training. They are held divided by this."""
+"""Adam moves a parameter by at most its learning rate a step: too little for the log of a width,
+which has to change by whole units within a training. It is held divided by this."""
 
 
 class SpatialSoftmaxLayer(nn.Module):
