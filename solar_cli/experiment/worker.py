@@ -99,7 +99,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             log.info("%s%s", outcome.value, f": {error}" if error else "")
             store.end(options.cell, options.attempt, outcome, error)
         except (Orphaned, Fenced) as error:
-            log.warning("ends without a trace: %s", error or "its supervisor is gone")
+            log.warning("ends without a trace: %s", str(error) or "its supervisor is gone")
             return 1
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     log.info("peak memory %d MiB", peak // 1024)

@@ -29,7 +29,7 @@ from solar_cli.settings.local import LocalMethod
 from solar_cli.streams import Streams
 
 ACTIVE_SHARE = 0.1  # of a latent's variance that its mean must carry for it to count as active
-LEAST_EXPLAINED = 0.2  # of the variance of each channel: one that is lost explains nothing
+LEAST_EXPLAINED = 0.5  # of the variance of each channel
 LEAST_COST_R2 = 0.5
 
 CostScore = Callable[[Tensor, Episodes], float]

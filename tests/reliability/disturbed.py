@@ -60,8 +60,14 @@ class Matrix:
         self.kills += 1
 
     def die_after(self, seconds: float, who: str) -> None:
-        """Kill -9 ``who`` at that age of the run: ``workers``, ``scheduler`` or ``all``."""
+        """Kill -9 ``who`` when the first worker has computed for a time.
+
+        ``who`` is ``workers``, ``scheduler`` or ``all``; nobody is left to kill after the end.
+        """
         scheduler = self.start()
+        started = time.time()
+        while scheduler.poll() is None and not self._computing(started):
+            time.sleep(0.02)
         time.sleep(seconds)
         victims = [] if who == "scheduler" else children(scheduler.pid)
         if who != "workers" and scheduler.poll() is None:
@@ -71,6 +77,14 @@ class Matrix:
                 os.kill(pid, signal.SIGKILL)
                 self.kills += 1
         scheduler.wait(timeout=120)
+
+    def _computing(self, since: float) -> bool:
+        """Whether a worker has left its imports behind, and written something."""
+        files = list(self.folder.glob("cells/*/episodes/*"))
+        files += list(self.folder.glob("cells/*/checkpoints/*"))
+        with suppress(FileNotFoundError):  # written files come and go
+            return any(file.stat().st_mtime > since for file in files)
+        return True
 
     def finish(self) -> list[dict[str, Any]]:
         """The next run, which nothing disturbs; what became of each cell."""
@@ -99,3 +113,4 @@ class Undisturbed:
 
     fingerprints: dict[str, dict[str, str]]
     seconds: float
+    """of computing, without the start of the processes"""

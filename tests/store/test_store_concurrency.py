@@ -1,19 +1,25 @@
-"""Several processes at one SQLite file: nothing fails, nothing is lost, nothing is seen half."""
+"""Several processes at one database: nothing fails, nothing is lost, nothing is seen half."""
 
 import multiprocessing
 import sqlite3
 import time
 from collections import Counter
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
 from multiprocessing.synchronize import Barrier
 from pathlib import Path
 from typing import Any
 
 import pytest
+from sqlalchemy import func, select
 
 from solar_cli.settings import Cell, cells, load_card
+from solar_cli.store.address import locate
+from solar_cli.store.database import Database
+from solar_cli.store.migrate import upgrade
 from solar_cli.store.owner import Owner
 from solar_cli.store.records import CellBusy, Metric
+from solar_cli.store.schema import CellRow
 from solar_cli.store.store import Store
 
 # Processes of their own, not forks of this one, which may hold threads and connections.
@@ -152,3 +158,29 @@ def test_of_many_that_open_an_empty_server_one_creates_and_all_go_on(
     assert together(create, *((address, seed) for seed in range(4))) == ["opened"] * 4
     with Store.open(address, read_only=True) as store:
         assert [record.cell.seed for record in store.cells()] == [0, 1, 2, 3]
+
+
+def test_who_opens_while_another_creates_waits_for_it(address: str) -> None:
+    first = Database(locate(address), read_only=False)
+    with ThreadPoolExecutor(1) as threads:
+        with first.altering() as connection:
+            upgrade(connection)
+            second = threads.submit(Store.open, address)
+            with pytest.raises(TimeoutError):
+                second.result(timeout=0.3)
+        with second.result(timeout=30) as store:
+            assert store.cells() == []
+    first.close()
+
+
+def test_all_statements_of_a_reading_see_one_moment(store: Store) -> None:
+    # SQLite lets no writer commit during a reading, so there the writer waits for its end.
+    count = select(func.count()).select_from(CellRow)
+    with ThreadPoolExecutor(1) as threads:
+        with store._database.reading() as session:
+            assert session.scalars(count).one() == 0
+            adding = threads.submit(store.add, [nav(0)])
+            wait([adding], timeout=0.3)
+            assert session.scalars(count).one() == 0
+        adding.result(timeout=30)
+    assert len(store.cells()) == 1
