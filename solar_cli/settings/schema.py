@@ -62,6 +62,18 @@ def hashed_values(settings: BaseModel) -> dict[str, Any]:
     return values
 
 
+def completed(settings: type[BaseModel], stored: dict[str, Any]) -> dict[str, Any]:
+    """Stored values, with settings that came later at the value that old runs had in effect."""
+    values = dict(stored)
+    for name, field in settings.model_fields.items():
+        extra, inner = _extra(field), field.annotation
+        if name not in values and "added" in extra:
+            values[name] = extra["added"]
+        elif isinstance(inner, type) and issubclass(inner, BaseModel) and name in values:
+            values[name] = completed(inner, values[name])
+    return values
+
+
 def source_of(settings: type[BaseModel], path: tuple[str, ...]) -> tuple[str, str]:
     """Description and source of the field at ``path`` below a settings class."""
     field = settings.model_fields[path[0]]

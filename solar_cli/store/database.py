@@ -22,7 +22,7 @@ from sqlalchemy.orm import Session
 from solar_cli.errors import SolarError, UsageError
 from solar_cli.store.address import Location
 
-WAIT = 30.0
+WAIT = 60.0
 """seconds that a connection waits for another's lock"""
 LOCK = 0x501A5
 """number of the advisory lock under which a server's schema is made and cells are added"""

@@ -49,10 +49,10 @@ class Moment(TypeDecorator[datetime]):
 
 
 class Base(DeclarativeBase):
-    """All tables. Text sorts by its bytes on every database, so that listings are the same."""
+    """All tables."""
 
     type_annotation_map = {  # noqa: RUF012
-        str: Text().with_variant(Text(collation="C"), "postgresql"),
+        str: Text,
         int: BigInteger,
         float: Double,
         bytes: LargeBinary,

@@ -10,6 +10,8 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "experiment"))  # where `b
 
 from disturbed import Matrix, Undisturbed
 
+from solar_cli.store.store import Store
+
 
 @pytest.fixture
 def matrix(tmp_path: Path) -> Iterator[Callable[[int], Matrix]]:

@@ -3,8 +3,10 @@
 import random
 from collections.abc import Callable
 
+import pytest
 from disturbed import Matrix, Undisturbed
 
+pytestmark = pytest.mark.timeout(900)  # many processes, each of which imports torch
 KILLS = 10
 
 

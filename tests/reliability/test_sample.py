@@ -2,8 +2,10 @@
 
 from collections.abc import Callable
 
+import pytest
 from disturbed import Matrix, Undisturbed
 
+pytestmark = pytest.mark.timeout(900)  # many processes, each of which imports torch
 KILLS = (  # in iteration 1, ...
     "training:1:worker",
     "renamed:1:both",

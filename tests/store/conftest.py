@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import text
+from sqlalchemy import create_engine
 
 from solar_cli.settings import Cell, cells, load_card
+from solar_cli.store.address import locate
 from solar_cli.store.owner import Owner
 from solar_cli.store.store import Store
 
@@ -34,19 +35,23 @@ def postgresql() -> Iterator[str]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
+@pytest.fixture
+def server(postgresql: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """Address of an empty database on a server."""
+    monkeypatch.setenv("SOLAR_HOME", str(tmp_path))
+    yield postgresql
+    engine = create_engine(str(locate(postgresql).place))
+    with engine.begin() as connection:
+        connection.exec_driver_sql("DROP SCHEMA public CASCADE; CREATE SCHEMA public")
+    engine.dispose()
+
+
 @pytest.fixture(params=["sqlite", "postgresql"])
-def address(
-    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[str]:
+def address(request: pytest.FixtureRequest, tmp_path: Path) -> str:
     """Address of an empty database of each kind."""
     if request.param == "sqlite":
-        yield str(tmp_path / "solar.db")
-        return
-    monkeypatch.setenv("SOLAR_HOME", str(tmp_path))
-    uri = request.getfixturevalue("postgresql")
-    yield uri
-    with Store.open(uri) as store, store._database.altering() as connection:
-        connection.execute(text("DROP SCHEMA public CASCADE; CREATE SCHEMA public"))
+        return str(tmp_path / "solar.db")
+    return str(request.getfixturevalue("server"))
 
 
 @pytest.fixture

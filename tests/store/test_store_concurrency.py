@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import func, select
+from sqlalchemy import create_engine, func, select
 
 from solar_cli.settings import Cell, cells, load_card
 from solar_cli.store.address import locate
@@ -25,7 +25,7 @@ from solar_cli.store.store import Store
 # Processes of their own, not forks of this one, which may hold threads and connections.
 processes = multiprocessing.get_context("forkserver")
 processes.set_forkserver_preload(["solar_cli.store.store", "alembic.command"])
-WRITERS, ITERATIONS, METRICS = 8, 12, 10
+WRITERS, ITERATIONS, METRICS = 8, 8, 10
 
 
 def nav(seed: int) -> Cell:
@@ -147,14 +147,14 @@ def test_of_many_that_open_an_empty_path_one_creates_and_all_go_on(tmp_path: Pat
 
 
 def test_of_many_that_open_an_empty_server_one_creates_and_all_go_on(
-    postgresql: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    postgresql: str,
 ) -> None:
     address = postgresql.replace("/postgres?", "/created?")
-    with Store.open(postgresql) as store:
-        engine = store._database._engine.execution_options(isolation_level="AUTOCOMMIT")
-        with engine.connect() as connection:
-            connection.exec_driver_sql("DROP DATABASE IF EXISTS created WITH (FORCE)")
-            connection.exec_driver_sql("CREATE DATABASE created")
+    server = create_engine(str(locate(postgresql).place), isolation_level="AUTOCOMMIT")
+    with server.connect() as connection:
+        connection.exec_driver_sql("DROP DATABASE IF EXISTS created WITH (FORCE)")
+        connection.exec_driver_sql("CREATE DATABASE created")
+    server.dispose()
     assert together(create, *((address, seed) for seed in range(4))) == ["opened"] * 4
     with Store.open(address, read_only=True) as store:
         assert [record.cell.seed for record in store.cells()] == [0, 1, 2, 3]
@@ -184,3 +184,29 @@ def test_all_statements_of_a_reading_see_one_moment(store: Store) -> None:
             assert session.scalars(count).one() == 0
         adding.result(timeout=30)
     assert len(store.cells()) == 1
+
+
+def test_writes_to_one_cell_wait_for_each_other(claimed: tuple[Store, str, int]) -> None:
+    store, hash, attempt = claimed
+    with ThreadPoolExecutor(1) as threads:
+        with store._database.writing() as session:
+            store._locked(session, hash)
+            later = threads.submit(store.beat, hash, attempt, "later", 0.5)
+            with pytest.raises(TimeoutError):
+                later.result(timeout=0.3)
+        later.result(timeout=30)
+    assert store.attempts(hash)[0].activity == "later"
+
+
+def add(barrier: Barrier, address: str) -> str:
+    with Store.open(address) as store:
+        barrier.wait()
+        store.add([nav(seed) for seed in range(50)])
+    return "added"
+
+
+def test_of_many_that_add_the_same_cells_none_fails(address: str) -> None:
+    Store.open(address).close()
+    assert together(add, *[(address,)] * 3) == ["added"] * 3
+    with Store.open(address) as store:
+        assert len(store.cells()) == 50

@@ -12,7 +12,7 @@ from alembic.autogenerate import compare_metadata
 from alembic.config import Config
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from sqlalchemy import Engine, event
+from sqlalchemy import Engine, Text, event, text
 from test_store_concurrency import processes
 
 from solar_cli.settings import Cell, restore
@@ -30,6 +30,19 @@ MakeCells = Callable[..., list[Cell]]
 def test_the_migrations_make_what_the_classes_say(store: Store) -> None:
     with store._database._engine.connect() as connection:
         assert compare_metadata(MigrationContext.configure(connection), Base.metadata) == []
+
+
+def test_text_sorts_by_its_bytes_on_a_server_too(server: str) -> None:
+    with Store.open(server) as store, store._database.reading() as session:
+        collations = session.execute(
+            text(
+                "SELECT collation_name, count(*) FROM information_schema.columns "
+                "WHERE table_schema = 'public' AND table_name <> 'alembic_version' "
+                "AND data_type = 'text' GROUP BY collation_name"
+            )
+        ).all()
+    columns = [c for t in Base.metadata.tables.values() for c in t.columns]
+    assert collations == [("C", sum(isinstance(c.type, Text) for c in columns))]
 
 
 def test_the_versions_that_opening_knows_are_those_of_the_migrations() -> None:

@@ -6,6 +6,7 @@ from alembic import op
 revision = "solar_0001"
 down_revision = None
 
+# Text sorts by its bytes on every database, so that listings are the same.
 TEXT = sa.Text().with_variant(sa.Text(collation="C"), "postgresql")
 MOMENT = sa.DateTime(timezone=True)
 

@@ -1,0 +1,159 @@
+"""What was tried is built upon, or taken back, by collected costs and their standard errors."""
+
+import io
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from solar_cli.control.linear_gaussian import LinearGaussianPolicy, initial_policy
+from solar_cli.control.step_size import StepSize
+from solar_cli.control.trust_region import Anchor, TrustRegion
+from solar_cli.episodes import Episodes
+
+GAINS = initial_policy(3, 2, 1, 0.5)
+
+
+def tried(iteration: int, cost: float, error: float = 1.0) -> Anchor:
+    return Anchor(iteration, GAINS, cost, error)
+
+
+def region(**changes) -> TrustRegion:
+    return TrustRegion(StepSize(low=0.3, high=2.0), **changes)
+
+
+def after(*costs: float, tolerance=1.0, error=1.0) -> TrustRegion:
+    """Iterations of these costs; every update promised what would keep the step."""
+    state = region()
+    for iteration, cost in enumerate(costs, 1):
+        state = state.judged(tried(iteration, cost, error), tolerance)
+    return state
+
+
+def test_a_batch_is_judged_by_the_sums_of_its_episodes():
+    costs = np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 9.0]])
+    zeros = np.zeros((3, 2, 1))
+    anchor = Anchor.of(4, GAINS, Episodes(np.zeros((3, 3, 1)), zeros, zeros, costs))
+    assert anchor.iteration == 4
+    assert anchor.gains is GAINS
+    assert anchor.cost == pytest.approx((3 + 7 + 14) / 3)
+    # Deviations -5, -1, 6: variance 62 / 2, over 3 episodes.
+    assert anchor.error == pytest.approx(math.sqrt(31 / 3))
+
+
+def test_one_episode_has_no_error():
+    zeros = np.zeros((1, 2, 1))
+    episodes = Episodes(np.zeros((1, 3, 1)), zeros, zeros, np.ones((1, 2)))
+    assert Anchor.of(1, GAINS, episodes) == Anchor(1, GAINS, 2.0, 0.0)
+
+
+def test_the_first_batch_is_the_best_and_the_one_to_build_upon():
+    state = after(10.0)
+    assert state.best == state.current == tried(1, 10.0)
+    assert not state.rejected
+    assert math.isnan(state.kept)
+    assert state.step.multiplier == 1.0
+
+
+def test_a_better_batch_is_the_new_best():
+    state = after(10.0, 8.0)
+    assert state.best == state.current == tried(2, 8.0)
+    assert state.kept == 2.0
+    assert not state.rejected
+
+
+def test_a_batch_that_is_worse_by_its_noise_is_built_upon_but_not_the_best():
+    # The margin of two errors of 1 is sqrt 2.
+    state = after(10.0, 11.4)
+    assert state.current == tried(2, 11.4)
+    assert state.best == tried(1, 10.0)
+    assert state.kept == pytest.approx(-1.4)
+    assert not state.rejected
+
+
+def test_a_batch_that_is_worse_by_more_is_taken_back():
+    state = after(10.0, 11.5)
+    assert state.current == state.best == tried(1, 10.0)
+    assert state.rejected
+    assert state.kept == pytest.approx(-1.5)
+    assert state.step.multiplier == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize(("tolerance", "taken_back"), [(0.5, True), (2.0, False), ("never", False)])
+def test_the_tolerance_is_in_standard_errors(tolerance, taken_back):
+    assert after(10.0, 11.5, tolerance=tolerance).rejected == taken_back
+
+
+def test_without_rejection_anything_is_built_upon():
+    state = after(10.0, 1e6, tolerance="never")
+    assert state.current == tried(2, 1e6)
+    assert state.best == tried(1, 10.0)
+
+
+def test_small_steps_downhill_cannot_lead_away_from_the_best():
+    """Each batch is within the noise of the one before, but not of the best."""
+    state = after(10.0, 11.0, 12.0)
+    assert state.rejected
+    assert state.current == tried(1, 10.0)
+
+
+def test_what_follows_a_rejection_is_compared_with_what_it_was_built_upon():
+    state = after(10.0, 20.0, 9.0)
+    assert state.kept == 1.0
+    assert state.best == state.current == tried(3, 9.0)
+    assert not state.rejected
+
+
+def test_the_best_never_gets_worse_nor_is_it_replaced_by_an_equal():
+    rng = np.random.default_rng(0)
+    costs = rng.normal(10.0, 3.0, 60)
+    state, least = region(), math.inf
+    for iteration, cost in enumerate(costs, 1):
+        state = state.judged(tried(iteration, float(cost)), 1.0)
+        least = min(least, cost)
+        assert state.best.cost == least
+    assert state.best.iteration == int(np.argmin(costs)) + 1
+    again = state.judged(tried(99, state.best.cost), 1.0)
+    assert again.best.iteration == state.best.iteration
+
+
+def test_the_step_follows_what_was_promised_and_kept():
+    promised = region(promised=4.0, best=tried(1, 10.0), current=tried(1, 10.0))
+    assert promised.judged(tried(2, 6.0), 1.0).step == StepSize(low=0.3, high=2.0).after(4.0, 4.0)
+    assert promised.judged(tried(2, 6.0), 1.0).step.multiplier == 2.0
+    assert promised.judged(tried(2, 8.0), 1.0).step.multiplier == 1.0
+    assert promised.judged(tried(2, 9.9), 1.0).step.multiplier < 0.6
+    assert promised.judged(tried(2, 99.0), 1.0).step.multiplier == pytest.approx(0.4)
+
+
+def test_metrics_say_what_happened():
+    state = region(promised=4.0, best=tried(1, 10.0), current=tried(1, 10.0))
+    assert state.judged(tried(2, 99.0), 1.0).metrics() == {
+        "predicted_improvement": 4.0,
+        "actual_improvement": -89.0,
+        "rejected": 1.0,
+        "step_multiplier": 0.4,
+    }
+
+
+@pytest.mark.parametrize("costs", [(), (10.0,), (10.0, 11.0), (10.0, 20.0)])
+def test_a_saved_trust_region_goes_on_as_it_would_have(costs):
+    state = after(*costs)
+    buffer = io.BytesIO()
+    torch.save(state.state_dict(), buffer)
+    buffer.seek(0)
+    restored = region().restored(torch.load(buffer, weights_only=True))
+    for cost in (9.0, 12.0, 30.0):
+        left, right = (s.judged(tried(7, cost), 1.0) for s in (state, restored))
+        for name in ("step", "kept", "rejected", "promised"):
+            assert str(getattr(left, name)) == str(getattr(right, name)), name
+        for name in ("best", "current"):
+            one, other = getattr(left, name), getattr(right, name)
+            assert (one.iteration, one.cost, one.error) == (
+                other.iteration,
+                other.cost,
+                other.error,
+            )
+            assert isinstance(other.gains, LinearGaussianPolicy)
+            assert all(torch.equal(*pair) for pair in zip(one.gains, other.gains, strict=True))

@@ -1,0 +1,113 @@
+"""A local method at work on the smoke variant of nav, made smaller still."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from solar_cli.envs import build_task
+from solar_cli.episodes import Environment
+from solar_cli.settings import cells, load, load_card, method
+from solar_cli.streams import Streams
+
+
+class Run:
+    """One cell: its environment, its learner, and what each iteration returned.
+
+    ``costs`` changes those of an iteration, given its number.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        name: str = "solar",
+        *sets: str,
+        seed: int = 0,
+        pulse: Callable[[str, float], None] = lambda *_: None,
+        wrap: Callable[[Any], Any] = lambda task: task,
+        costs: Callable[[int, np.ndarray], np.ndarray] | None = None,
+    ) -> None:
+        small = ("training.steps=12", 'cost_fit.per_time="never"', *sets)
+        changes = ["task.horizon=6", *(f"methods.{name}.{text}" for text in small)]
+        [cell] = cells(load_card("nav"), name, [seed], "smoke", changes)
+        self.configuration = cell.configuration
+        streams, task = Streams(seed), cell.configuration.task
+        simulator = wrap(build_task(task))
+        if costs is not None:
+            simulator = Costing(simulator, lambda c: costs(self.environment.iteration, c))
+        self.environment = Environment(simulator, task, streams.under("environment"), folder)
+        self.learner = load(method(name).learner)(
+            cell.configuration.method, task, streams.under("learner"), "cpu", pulse
+        )
+        self.metrics: list[dict[str, float]] = []
+
+    def iterate(self, first: int, last: int) -> Run:
+        """Iterations ``first`` to ``last``; wall-clock is left out of what they return."""
+        for iteration in range(first, last + 1):
+            self.environment.begin(iteration)
+            metrics = self.learner.iterate(self.environment)
+            self.metrics.append({k: v for k, v in metrics.items() if not k.startswith("seconds_")})
+        return self
+
+    def state(self) -> dict[str, Any]:
+        """What a checkpoint holds, as a file gives it back."""
+        buffer = io.BytesIO()
+        parts = {"learner": self.learner.state_dict(), "environment": self.environment.state_dict()}
+        torch.save(parts, buffer)
+        buffer.seek(0)
+        state: dict[str, Any] = torch.load(buffer, weights_only=True)
+        return state
+
+    def restore(self, state: dict[str, Any]) -> Run:
+        """Take up what a checkpoint holds."""
+        self.environment.load_state_dict(state["environment"])
+        self.learner.load_state_dict(state["learner"])
+        return self
+
+    def bits(self) -> str:
+        """SHA-256 of all state."""
+        return digest(self.state())
+
+
+def digest(value: Any) -> str:
+    """SHA-256 of plain data and tensors, to the last bit."""
+    found = hashlib.sha256()
+
+    def feed(part: Any) -> None:
+        if isinstance(part, torch.Tensor):
+            found.update(f"{part.dtype}{tuple(part.shape)}".encode())
+            found.update(part.detach().contiguous().numpy().tobytes())
+        elif isinstance(part, dict):
+            for key in sorted(part, key=repr):
+                if not str(key).startswith("seconds_"):
+                    found.update(repr(key).encode())
+                    feed(part[key])
+        elif isinstance(part, list | tuple):
+            found.update(f"[{len(part)}".encode())
+            for item in part:
+                feed(item)
+        else:
+            found.update(repr(part).encode())
+
+    feed(value)
+    return found.hexdigest()
+
+
+class Costing:
+    """A task whose costs are changed on the way to the learner."""
+
+    def __init__(self, task: Any, change: Callable[[np.ndarray], np.ndarray]) -> None:
+        self._task, self._change = task, change
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._task, name)
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        frames, costs = self._task.step(actions)
+        return frames, self._change(costs)

@@ -1,0 +1,98 @@
+"""LINEARIZEPOLICY within Algorithm 1: the encoder changes, the acting policy does not."""
+
+import numpy as np
+import pytest
+import torch
+from method_runs import Run
+
+from solar_cli.episodes import window_indices
+from solar_cli.methods import solar
+
+EPISODES = "batches={ initial = 16, noisy = 16 }"
+
+
+def acted(run, episodes) -> np.ndarray:
+    """The means (N, T, a) of the learner's policy on recorded frames."""
+    policy = run.learner.policy
+    state, means = policy.start(len(episodes), None), []
+    index = window_indices(episodes.horizon, episodes.window)
+    for t in range(episodes.horizon):
+        _, mean, state = policy.act(episodes.frames[:, index[t]], t, state)
+        means.append(mean)
+    return np.stack(means, axis=1)
+
+
+def change(run, episodes) -> float:
+    """How far the policy's means are from the recorded ones, in units of their spread."""
+    recorded = episodes.action_means
+    spread = recorded - recorded.mean(axis=0)
+    assert spread.std() > 1e-4  # the policy looks at what it sees
+    return float(
+        np.sqrt(np.square(acted(run, episodes) - recorded).mean() / np.square(spread).mean())
+    )
+
+
+def before_the_update(tmp_path, linearise: str):
+    """A run that has collected its third batch, and that batch."""
+    run = Run(tmp_path, "solar", EPISODES, f"update.linearise={linearise}").iterate(1, 2)
+    run.environment.begin(3)
+    tried = run.learner.collect(run.environment)
+    region = run.learner.trust_region.judged(tried, "never")
+    return run, region, run.learner.batches(run.environment, region)[0]
+
+
+@pytest.mark.parametrize(("linearise", "preserved"), [("true", True), ("false", False)])
+def test_a_changed_head_is_undone_by_line_six_alone(tmp_path, linearise, preserved):
+    run, region, episodes = before_the_update(tmp_path, linearise)
+    assert change(run, episodes) < 1e-3  # nothing has changed yet, but for batches of float32
+    head = run.learner.representation._model.networks.mean[-1]
+    noise = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for parameter in head.parameters():
+            step = torch.randn(parameter.shape, generator=noise) * parameter.std()
+            parameter += 0.5 * step
+    run.learner.representation.moved = True
+    assert change(run, episodes) > 0.3
+    states = run.learner.embedded(episodes)
+    run.learner.gains = run.learner.linearised(region, states).policy
+    # The head is the last, linear layer: its change is affine in latents, which line 6 undoes.
+    assert (change(run, episodes) < 0.01) == preserved
+    if not preserved:
+        assert change(run, episodes) > 0.3
+
+
+def test_fine_tuning_preserves_the_acting_policy(tmp_path, monkeypatch):
+    """A real training between collecting and updating; the policy to improve is looked at."""
+    errors = {}
+    for linearise in ("true", "false"):
+        run = Run(
+            tmp_path / linearise,
+            "solar",
+            EPISODES,
+            f"update.linearise={linearise}",
+            "training.fine_tune_steps=12",
+            "training.fine_tune_rate=0.002",
+        )
+        run.iterate(1, 2)
+        seen = []
+        improve = solar.improve_policy
+        monkeypatch.setattr(
+            solar, "improve_policy", lambda *a, seen=seen, f=improve: seen.append(a) or f(*a)
+        )
+        run.iterate(3, 3)
+        monkeypatch.undo()
+        chosen = run.learner.trust_region.current.iteration
+        [episodes] = run.environment.collected(chosen)
+        run.learner.gains = seen[0][0]
+        errors[linearise] = change(run, episodes)
+    assert errors["true"] < 0.3
+    assert errors["false"] > 3 * errors["true"]
+
+
+def test_a_frozen_encoder_leaves_the_policy_as_it_is(tmp_path):
+    run, region, episodes = before_the_update(tmp_path, "true")
+    run.learner.representation.update(run.environment)
+    assert not run.learner.representation.moved
+    previous = run.learner.linearised(region, run.learner.embedded(episodes))
+    for left, right in zip(previous.policy, run.learner.gains, strict=True):
+        assert torch.equal(left, right)

@@ -1,0 +1,85 @@
+"""An iteration that was interrupted at any pulse ends with the bits of one that was not."""
+
+import pytest
+from method_runs import Run
+
+from solar_cli.errors import SolarError
+
+FINE_TUNING = ("training.fine_tune_steps=8", "training.fine_tune_rate=0.003")
+
+
+@pytest.mark.parametrize(
+    ("name", "sets", "pulses"),
+    [
+        ("solar", FINE_TUNING, 3 + 2 + 2),
+        ("solar", ("training.attempts=2",), 2 * 3),
+        ("solar", ('dynamics.factors="varying"', 'dynamics.rows="all"'), 3),
+        ("vae", FINE_TUNING, 3 + 2 + 2),
+    ],
+    ids=["solar fine-tuned", "solar frozen, two attempts", "solar as in Eq. 5", "vae fine-tuned"],
+)
+def test_a_run_interrupted_at_any_pulse_ends_with_the_same_bits(tmp_path, name, sets, pulses):
+    last, saved = 3, []
+    whole = Run(
+        tmp_path,
+        name,
+        *sets,
+        pulse=lambda *_: saved.append((whole.environment.iteration, whole.state())),
+    )
+    whole.iterate(1, last)
+    assert len(saved) == pulses
+    for iteration, state in saved:
+        resumed = Run(tmp_path, name, *sets).restore(state).iterate(iteration, last)
+        assert repr(resumed.metrics) == repr(whole.metrics[iteration - 1 :])
+        assert resumed.bits() == whole.bits()
+
+
+@pytest.mark.parametrize("name", ["solar", "vae"])
+def test_a_run_interrupted_between_iterations_ends_with_the_same_bits(tmp_path, name):
+    whole = Run(tmp_path / "whole", name)
+    parts = Run(tmp_path / "parts", name).iterate(1, 1)
+    assert parts.state() is not None
+    whole.iterate(1, 3)
+    for iteration in (2, 3):
+        state = parts.state()
+        parts = Run(tmp_path / "parts", name).restore(state).iterate(iteration, iteration)
+        assert repr(parts.metrics[0]) == repr(whole.metrics[iteration - 1])
+    assert parts.bits() == whole.bits()
+
+
+def test_an_iteration_that_is_repeated_gives_the_same_bits(tmp_path):
+    """A checkpoint before the iteration is taken up, though its episodes are on disk already."""
+    once = Run(tmp_path, "solar", *FINE_TUNING).iterate(1, 1)
+    state = once.state()
+    once.iterate(2, 2)
+    again = Run(tmp_path, "solar", *FINE_TUNING).restore(state).iterate(2, 2)
+    assert again.bits() == once.bits()
+
+
+@pytest.mark.parametrize("name", ["solar", "vae"])
+def test_a_cell_has_its_bits(tmp_path, name):
+    runs = [Run(tmp_path / str(i), name, seed=i // 2).iterate(1, 2) for i in range(3)]
+    assert runs[0].bits() == runs[1].bits()
+    assert repr(runs[0].metrics) == repr(runs[1].metrics)
+    assert runs[2].bits() != runs[0].bits()
+
+
+@pytest.mark.parametrize("iteration", [1, 2])
+def test_episodes_lost_inside_an_iteration_come_back_or_are_missed(tmp_path, iteration):
+    """What a half-trained encoder would collect is not what its iteration has collected."""
+    saved = []
+    whole = Run(
+        tmp_path,
+        "solar",
+        *FINE_TUNING,
+        pulse=lambda *_: saved.append((whole.environment.iteration, whole.state())),
+    )
+    whole.iterate(1, 2)
+    state = next(state for number, state in saved if number == iteration)
+    (tmp_path / f"{iteration:04d}-0.npz").unlink()
+    resumed = Run(tmp_path, "solar", *FINE_TUNING).restore(state)
+    try:
+        found = resumed.iterate(iteration, 2).bits()
+    except (SolarError, OSError) as error:
+        found = str(error)
+    assert found == whole.bits() or f"{iteration:04d}-0.npz" in found
