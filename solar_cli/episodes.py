@@ -165,7 +165,7 @@ def evaluate(
 
 
 class Environment:
-    """The world as a learner meets it: it collects, and what it collects counts.
+    """The world that a cell learns in: it collects, and what it collects counts.
 
     Collections are keyed by (iteration, call): repeating an iteration after an interruption finds
     its episodes on disk, or, when a file is damaged, collects the very same ones again.
@@ -216,14 +216,14 @@ class Environment:
         self._kept[key] = found
         return found
 
-    def recent(self, batches: int) -> list[Episodes]:
-        """The collections of the last ``batches`` iterations, this one included, oldest first."""
-        first = self.iteration - batches
-        return [self._get(e) for e in self._ledger if first < e["iteration"] <= self.iteration]
+    def collected(self, iteration: int) -> Episodes:
+        """All episodes of one iteration."""
+        return Episodes.joined([self._get(e) for e in self._ledger if e["iteration"] == iteration])
 
-    def collected(self, iteration: int) -> list[Episodes]:
-        """The collections of one iteration, in the order of their calls."""
-        return [self._get(entry) for entry in self._ledger if entry["iteration"] == iteration]
+    def recent(self, batches: int) -> list[Episodes]:
+        """The episodes of each of the last ``batches`` iterations, this one last."""
+        first = max(1, self.iteration - batches + 1)
+        return [self.collected(iteration) for iteration in range(first, self.iteration + 1)]
 
     def summary(self, iteration: int) -> dict[str, float]:
         """Means over the noisy episodes of an iteration: return, final measures, clipped share."""
@@ -299,3 +299,13 @@ class Environment:
                 "clipped": float(clipped.mean()),
             },
         }
+
+
+class Experience:
+    """An `Environment` as a learner meets it: episodes, and nothing that only a judge may see."""
+
+    def __init__(self, environment: Environment) -> None:
+        self.collect = environment.collect
+        self.collected = environment.collected
+        self.recent = environment.recent
+        self.iteration = environment.iteration

@@ -14,6 +14,7 @@ from solar_cli.episodes import (
     Environment,
     Episodes,
     Evaluation,
+    Experience,
     evaluate,
     roll_out,
     window_indices,
@@ -194,7 +195,7 @@ def test_collected_episodes_count_once(environment: Environment):
     environment.begin(2)  # the iteration is repeated
     environment.collect(Pull(), 3)
     assert (environment.episodes, environment.steps) == (9, 9 * T)
-    assert [len(batch) for batch in environment.collected(1)] == [4, 2]
+    assert [len(environment.collected(iteration)) for iteration in (1, 2)] == [6, 3]
 
 
 def test_a_repeated_iteration_finds_what_it_collected(environment: Environment):
@@ -205,19 +206,30 @@ def test_a_repeated_iteration_finds_what_it_collected(environment: Environment):
     assert_equal_bits(environment.collect(Pull(gain=0.9), 4), collected)
 
 
-def test_recent_batches_are_those_of_the_last_iterations_oldest_first(environment: Environment):
-    batches: dict[int, list[Episodes]] = {}
+def test_recent_batches_are_one_an_iteration_oldest_first(environment: Environment):
+    batches: dict[int, Episodes] = {}
     for iteration in (1, 2, 3, 4):
         environment.begin(iteration)
-        batches[iteration] = [environment.collect(Pull(), iteration)]
-        batches[iteration].append(environment.collect(Pull(), 1, noisy=False))
-    recent = environment.recent(2)
-    for found, expected in zip(recent, batches[3] + batches[4], strict=True):
+        calls = [environment.collect(Pull(), iteration)]
+        calls.append(environment.collect(Pull(), 1, noisy=False))
+        batches[iteration] = Episodes.joined(calls)
+    for found, expected in zip(environment.recent(2), (batches[3], batches[4]), strict=True):
         assert_equal_bits(found, expected)
-    assert [len(batch) for batch in environment.recent(1)] == [4, 1]
-    assert [len(batch) for batch in environment.recent(10)] == [1, 1, 2, 1, 3, 1, 4, 1]
-    environment.begin(2)
-    assert [len(batch) for batch in environment.recent(2)] == [1, 1, 2, 1]
+    assert_equal_bits(environment.collected(2), batches[2])
+    assert [len(batch) for batch in environment.recent(1)] == [5]
+    assert [len(batch) for batch in environment.recent(10)] == [2, 3, 4, 5]
+    environment.begin(2)  # what was collected later is not there yet
+    assert [len(batch) for batch in environment.recent(2)] == [2, 3]
+
+
+def test_a_learner_meets_its_experience_and_no_judge(environment: Environment):
+    environment.begin(3)
+    experience = Experience(environment)
+    collected = experience.collect(Pull(), 4)
+    assert experience.iteration == 3
+    assert_equal_bits(experience.collected(3), collected)
+    public = {name for name in dir(experience) if not name.startswith("_")}
+    assert public == {"collect", "collected", "recent", "iteration"}
 
 
 def test_an_iteration_is_summed_up_over_its_noisy_episodes(environment: Environment):
@@ -257,8 +269,7 @@ def test_a_file_gives_back_what_was_collected(environment: Environment):
     environment.begin(1)
     collected = [environment.collect(Pull(), 3), environment.collect(Pull(), 2, noisy=False)]
     fresh = again(environment, 1)
-    for found, expected in zip(fresh.recent(1), collected, strict=True):
-        assert_equal_bits(found, expected)
+    assert_equal_bits(fresh.collected(1), Episodes.joined(collected))
     assert fresh.summary(1) == environment.summary(1)
 
 

@@ -10,8 +10,8 @@ Axes: N episodes, T horizon, d latents of a block, z = W d entries, x = [z; a] w
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from functools import reduce
+from collections.abc import Callable, Sequence
+from functools import partial, reduce
 from itertools import product
 from typing import NamedTuple
 
@@ -21,8 +21,8 @@ from torch import Tensor
 
 from solar_cli.control.linear_gaussian import LinearDynamics
 from solar_cli.control.trajectories import Trajectories
-from solar_cli.inference import gmm, mniw, niw
-from solar_cli.models.basis import LatentPrior
+from solar_cli.inference import gmm, mniw
+from solar_cli.models.priors import LatentPrior
 from solar_cli.settings.local import LocalFit
 from solar_cli.streams import Streams
 
@@ -51,6 +51,13 @@ class Increments(NamedTuple):
     Sigma: Float[Tensor, "T d d"]
 
 
+Pairs = tuple[Tensor, Tensor]
+"""x (T, N, p) and y (T, N, d) of one batch"""
+
+Fit = Callable[[Tensor, Tensor], Increments]
+"""from x (T, N, p) and y (T, N, d) to the dynamics of every time step"""
+
+
 class LocalDynamics(NamedTuple):
     """The fit, and metrics of what chose it."""
 
@@ -67,18 +74,46 @@ def infer_dynamics(
 ) -> LocalDynamics:
     """Local dynamics around the newest batch, given older ones and the representation's factor."""
     x, y = newest.increments(prior.latent)
+    past = [batch.increments(prior.latent) for batch in older]
     metrics: dict[str, float] = {}
     if settings.method == "posterior":
-        sources = _sources(newest, older, prior, settings)
-        strengths, likelihood, r2 = _chosen(x, y, sources, settings)
-        increments = _posterior(x, y, sources, strengths)
-        metrics = {"one_step_log_likelihood": likelihood, "one_step_r2": r2}
-        metrics |= {f"prior_{name}": value for name, value in strengths._asdict().items()}
-    elif settings.method == "regression":
-        increments = _regression(x, y)
+        sources = _sources(newest, past, prior, settings)
+        grid = _grid(sources, settings)
+        scores = [_held_out(partial(_posterior, sources, s), x, y, settings.folds) for s in grid]
+        best = max(range(len(grid)), key=lambda i: scores[i].log_likelihood)
+        fit: Fit = partial(_posterior, sources, grid[best])
+        score = scores[best]
+        metrics = {f"prior_{name}": value for name, value in grid[best]._asdict().items()}
     else:
-        increments = _mixture_prior(x, y, streams)
-    return LocalDynamics(_whole(increments, newest, prior), metrics)
+        mixture = partial(_mixture_prior, past, streams)
+        fit = _regression if settings.method == "regression" else mixture
+        score = _held_out(fit, x, y, settings.folds)
+    metrics |= {"one_step_log_likelihood": score.log_likelihood, "one_step_r2": score.r2}
+    return LocalDynamics(_whole(fit(x, y), newest, prior), metrics)
+
+
+class _Score(NamedTuple):
+    """One-step prediction on folds that were left out of the fit."""
+
+    log_likelihood: float
+    """nats a transition"""
+    r2: float
+    """share of the increments' variance that is predicted"""
+
+
+def _held_out(fit: Fit, x: Float[Tensor, "T N p"], y: Float[Tensor, "T N d"], folds: int) -> _Score:
+    count = x.shape[1]
+    fold = torch.arange(count) % min(folds, count)
+    likelihood = squared = 0.0
+    for k in range(int(fold.max()) + 1):
+        judge = fold == k
+        fitted = fit(x[:, ~judge], y[:, ~judge])
+        residual = y[:, judge] - x[:, judge] @ fitted.F.mT - fitted.f.unsqueeze(1)
+        spread = fitted.Sigma * (1 + 1 / float((~judge).sum()))
+        likelihood += float(_log_density(residual, spread).sum())
+        squared += float(residual.square().sum())
+    total = float((y - y.mean(dim=(0, 1))).square().sum())
+    return _Score(likelihood / (count * len(x)), 1 - squared / max(total, 1e-12))
 
 
 class _Sources(NamedTuple):
@@ -90,7 +125,7 @@ class _Sources(NamedTuple):
 
 
 def _sources(
-    newest: Trajectories, older: Sequence[Trajectories], prior: LatentPrior, settings: LocalFit
+    newest: Trajectories, past: Sequence[Pairs], prior: LatentPrior, settings: LocalFit
 ) -> _Sources:
     d, actions = prior.latent, newest.actions.shape[-1]
     x, y = newest.increments(d)
@@ -104,9 +139,11 @@ def _sources(
         torch.diag(x.shape[1] * ridge.square()),
         degrees,
     )
-    model = None if prior.factor is None else _per_count(_in_basis(prior, actions))
-    past = [_centred_statistics(*batch.increments(d)) for batch in older]
-    joined = reduce(mniw.RegressionStatistics.plus, past) if past else None
+    model = None if prior.factor is None else _in_basis(prior, actions)
+    if model is not None and settings.prior_counts != "own":
+        model = _per_count(model)
+    statistics = [_centred_statistics(*pairs) for pairs in past]
+    joined = reduce(mniw.RegressionStatistics.plus, statistics) if statistics else None
     return _Sources(weak, model, None if joined is None else _per_count(joined))
 
 
@@ -151,24 +188,15 @@ def _pooled(own: mniw.RegressionStatistics, weight: Tensor) -> mniw.RegressionSt
     return mniw.RegressionStatistics(*(torch.einsum("ts,s...->t...", weight, part) for part in own))
 
 
-def _natural(
-    own: mniw.RegressionStatistics, sources: _Sources, strengths: Strengths
-) -> mniw.RegressionStatistics:
-    """Prior and data of every time step: appendix B is a sum in natural parameters."""
-    total = _pooled(own, _neighbourhood(len(own.n), strengths))
-    total = mniw.RegressionStatistics(*(t + r for t, r in zip(total, sources.ridge, strict=True)))
+def _posterior(
+    sources: _Sources, strengths: Strengths, x: Float[Tensor, "T N p"], y: Float[Tensor, "T N d"]
+) -> Increments:
+    """The point estimate of every time step: appendix B is a sum in natural parameters."""
+    own = _centred_statistics(x, y)
+    natural = _pooled(own, _neighbourhood(len(x), strengths)).plus(sources.ridge)
     for source, counts in ((sources.model, strengths.model), (sources.older, strengths.older)):
         if source is not None and counts:
-            total = mniw.RegressionStatistics(
-                *(t + counts * s for t, s in zip(total, source, strict=True))
-            )
-    return total
-
-
-def _posterior(
-    x: Float[Tensor, "T N p"], y: Float[Tensor, "T N d"], sources: _Sources, strengths: Strengths
-) -> Increments:
-    natural = _natural(_centred_statistics(x, y), sources, strengths)
+            natural = natural.plus(source.scaled(counts))
     F, Sigma = mniw.point_estimate(mniw.standard(natural))
     f = y.mean(dim=1) - (F @ x.mean(dim=1).unsqueeze(-1)).squeeze(-1)
     return Increments(F, f, Sigma + LEAST_VARIANCE * torch.eye(y.shape[-1]).to(y))
@@ -176,37 +204,14 @@ def _posterior(
 
 def _grid(sources: _Sources, settings: LocalFit) -> list[Strengths]:
     """All combinations that differ: no reach without neighbours, no counts without a source."""
+    counts = (1.0,) if settings.prior_counts == "own" else settings.prior_counts
     grid = product(
-        settings.prior_counts if sources.model is not None else (0.0,),
+        counts if sources.model is not None else (0.0,),
         settings.widths,
         settings.neighbours,
         settings.older_counts if sources.older is not None else (0.0,),
     )
     return list(dict.fromkeys(Strengths(m, w if k else 1.0, k, o) for m, w, k, o in grid))
-
-
-def _chosen(
-    x: Float[Tensor, "T N p"], y: Float[Tensor, "T N d"], sources: _Sources, settings: LocalFit
-) -> tuple[Strengths, float, float]:
-    """The strengths with the best held-out one-step likelihood, that likelihood (nats a
-    transition), and the share of increments' variance that the held-out prediction explains."""
-    count = x.shape[1]
-    fold = torch.arange(count) % min(settings.folds, count)
-    scores: list[tuple[float, float]] = []
-    grid = _grid(sources, settings)
-    for strengths in grid:
-        likelihood = squared = 0.0
-        for k in range(int(fold.max()) + 1):
-            judge = fold == k
-            fit = _posterior(x[:, ~judge], y[:, ~judge], sources, strengths)
-            residual = y[:, judge] - x[:, judge] @ fit.F.mT - fit.f.unsqueeze(1)
-            spread = fit.Sigma * (1 + 1 / float((~judge).sum()))
-            likelihood += float(_log_density(residual, spread).sum())
-            squared += float(residual.square().sum())
-        scores.append((likelihood, squared))
-    best = max(range(len(grid)), key=lambda i: scores[i][0])
-    total = float((y - y.mean(dim=(0, 1))).square().sum())
-    return grid[best], scores[best][0] / (count * len(x)), 1 - scores[best][1] / max(total, 1e-12)
 
 
 def _log_density(
@@ -232,11 +237,15 @@ def _regression(x: Float[Tensor, "T N p"], y: Float[Tensor, "T N d"]) -> Increme
 
 
 def _mixture_prior(
-    x: Float[Tensor, "T N p"], y: Float[Tensor, "T N d"], streams: Streams
+    past: Sequence[Pairs], streams: Streams, x: Float[Tensor, "T N p"], y: Float[Tensor, "T N d"]
 ) -> Increments:
-    """LQR-FLM's fit (Levine and Abbeel 2014): a Gaussian mixture is the prior of every step."""
+    """LQR-FLM's fit (Levine and Abbeel 2014): a Gaussian mixture is the prior of every step.
+
+    The mixture sees older batches too, as in the authors' release of guided policy search.
+    """
     points = torch.cat([x, y], dim=-1)
-    flat = points.flatten(0, 1)
+    seen = [points.flatten(0, 1), *(torch.cat(pairs, dim=-1).flatten(0, 1) for pairs in past)]
+    flat = torch.cat(seen)
     fit = gmm.fit_mixture(flat, gmm.cluster_count(len(flat)), streams.generator("mixture"))
     joint = gmm.fit_joint(points, gmm.local_prior(fit.mixture, points))
     F, f, Sigma = gmm.condition_joint(joint, x.shape[-1])
@@ -252,15 +261,6 @@ def _whole(increments: Increments, newest: Trajectories, prior: LatentPrior) -> 
     f = increments.f @ G.T + h
     Sigma = G @ increments.Sigma @ G.T
     start = newest.z[:, 0]
-    centre = start.mean(dim=0)
-    weak = niw.natural(
-        niw.NIW(
-            Psi=LEAST_VARIANCE * torch.eye(size).to(P),
-            nu=P.new_tensor(1.0),
-            mu0=centre,
-            kappa=P.new_tensor(1e-6),
-        )
-    )
-    initial = niw.standard(weak.plus(niw.initial_statistics(start)))
-    mu0, Sigma0 = niw.point_estimate(initial)
-    return LinearDynamics(F, f, Sigma, mu0, Sigma0)
+    centred = start - start.mean(dim=0)
+    Sigma0 = centred.T @ centred / len(start) + LEAST_VARIANCE * torch.eye(size).to(P)
+    return LinearDynamics(F, f, Sigma, start.mean(dim=0), Sigma0)

@@ -20,7 +20,7 @@ from solar_cli.settings.local import CostFit
 LBFGS_ROUNDS = 100
 SGD_STEPS = 1000
 SGD_RATE = 1e-2
-PULL = 1e-3  # of a fit per time step towards the global one, in units of its Hessian's diagonal
+PULL = 1e-3  # of a fit per time step towards the global one, on standardised costs
 
 
 class _Quadratic(NamedTuple):
@@ -85,6 +85,14 @@ def fit_quadratic_cost(
         best = _fit_each(z, target, best, settings)
     model = _assembled(best, states, action_cost, y.mean(), scale, settings.terminal)
     return FittedCost(model, r2, per_time)
+
+
+def explained(model: QuadraticCost, states: Trajectories) -> float:
+    """R2 of a fitted cost on other episodes."""
+    x = torch.cat([states.z[:, :-1], states.actions], dim=-1)
+    quadratic = 0.5 * torch.einsum("nti,tij,ntj->nt", x, model.C[:-1], x)
+    predicted = quadratic + torch.einsum("nti,ti->nt", x, model.c[:-1]) + model.b[:-1]
+    return _r2(predicted, states.costs)
 
 
 def _r2(predicted: Tensor, observed: Tensor) -> float:

@@ -10,7 +10,12 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
-from solar_cli.control.linear_gaussian import LinearGaussianPolicy
+from solar_cli.control.linear_gaussian import (
+    LinearDynamics,
+    LinearGaussianPolicy,
+    QuadraticCost,
+    expected_cost,
+)
 from solar_cli.control.step_size import StepSize
 from solar_cli.episodes import Episodes
 
@@ -65,11 +70,17 @@ class TrustRegion:
             rejected=False,
         )
 
+    @property
+    def built_upon(self) -> Anchor:
+        """What the next update starts from; there is none before a first policy was judged."""
+        assert self.current is not None
+        return self.current
+
     def metrics(self) -> dict[str, float]:
-        """What the last update promised, what it gave, and what follows."""
+        """What the last update promised and gave, once there was one, and what follows."""
+        falls = {"predicted_improvement": self.promised, "actual_improvement": self.kept}
         return {
-            "predicted_improvement": self.promised,
-            "actual_improvement": self.kept,
+            **(falls if math.isfinite(self.promised) else {}),
             "rejected": float(self.rejected),
             "step_multiplier": self.step.multiplier,
         }
@@ -92,6 +103,23 @@ class TrustRegion:
             current=_anchor(state["current"]),
             promised=state["promised"],
         )
+
+
+def promised_fall(
+    previous: LinearGaussianPolicy,
+    policy: LinearGaussianPolicy,
+    dynamics: LinearDynamics,
+    cost: QuadraticCost,
+) -> float:
+    """By how much the model says that the cost of t = 0..T-1 falls.
+
+    Without the weight of the last state, whose cost is never observed: what is collected is judged
+    by the same sum.
+    """
+    before, after = (
+        expected_cost(gains, dynamics, cost)[..., :-1].sum() for gains in (previous, policy)
+    )
+    return float(before - after)
 
 
 def _plain(anchor: Anchor | None) -> dict[str, Any] | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
+import resource
 import time
 from collections.abc import Sequence
 from typing import Any, Protocol
@@ -16,7 +17,7 @@ import numpy as np
 import torch
 
 from solar_cli.envs import build_task
-from solar_cli.episodes import Environment, Evaluation
+from solar_cli.episodes import Environment, Evaluation, Experience
 from solar_cli.errors import SolarError
 from solar_cli.experiment.checkpointing import Checkpoints
 from solar_cli.experiment.exhibits import exhibit
@@ -118,7 +119,7 @@ class Session:
         self._tell("starting")
         self._iterating = True
         try:
-            learned = self.learner.iterate(self.environment)
+            learned = self.learner.iterate(Experience(self.environment))
         except (np.linalg.LinAlgError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
             # What numbers that are no longer finite look like to a factorisation.
             raise Diverged(str(error)) from error
@@ -130,6 +131,8 @@ class Session:
     def _conclude(self, train: dict[str, float]) -> None:
         """Evaluate; then checkpoint file, metrics and progress become durable, in this order."""
         metrics = [Metric(name, value) for name, value in train.items()]
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+        metrics.append(Metric("peak_memory_bytes", peak))
         _require_finite_return(metrics)
         self._tell("evaluating")
         self._evaluation = self._judge.evaluate(self.learner.policy, self._iteration)

@@ -12,7 +12,7 @@ from solar_cli.pulse import Diverged, Pulse
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from solar_cli.episodes import Environment, Episodes, Evaluation, Policy
+    from solar_cli.episodes import Episodes, Evaluation, Experience, Policy
 
 __all__ = ["Diverged", "Learner", "Pulse"]
 
@@ -28,7 +28,7 @@ class Learner(Protocol):
     def policy(self) -> Policy:
         """The policy that it would hand over now."""
 
-    def iterate(self, environment: Environment) -> dict[str, float]:
+    def iterate(self, experience: Experience) -> dict[str, float]:
         """One iteration: collect, learn; the metrics of what happened. Raises `Diverged`.
 
         Restored from a state that was saved at a pulse inside an iteration, the next call does that

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from solar_cli.control.local_dynamics import infer_dynamics
 from solar_cli.control.lqr import improve_policy
-from solar_cli.episodes import Environment
+from solar_cli.control.trust_region import promised_fall
+from solar_cli.episodes import Experience
 from solar_cli.methods.local import LocalLearner
 from solar_cli.models.priors import LinearDynamics, Prior
 from solar_cli.settings.local import Solar as SolarSettings
@@ -23,25 +24,33 @@ class Solar(LocalLearner):
         assert isinstance(self.settings, SolarSettings)
         return LinearDynamics(self.settings.dynamics, self.latent, self.task, self.device)
 
-    def iterate(self, environment: Environment) -> dict[str, float]:
+    def iterate(self, experience: Experience) -> dict[str, float]:
         """One turn of Algorithm 1 (lines 4 to 8)."""
-        tried = self.collect(environment)  # line 4: N rollouts of the current policy
+        tried = self.collect(experience)  # line 4: N rollouts of the current policy
         region = self.trust_region.judged(tried, self.settings.update.reject)
-        episodes, older = self.batches(environment, region)
+        episodes, older = self.batches(experience, region)
 
-        fit = self.representation.update(environment)  # line 5: MODELUPDATE, section 3
+        model = self.representation.update(experience)  # line 5: MODELUPDATE, section 3
         states, older_states = self.embedded(episodes), [self.embedded(batch) for batch in older]
 
         previous = self.linearised(region, states)  # line 6: LINEARIZEPOLICY, appendix C
         dynamics = infer_dynamics(  # line 7: INFERDYNAMICS, section 4.1 and appendix B
             states,
             older_states,
-            self.representation.dynamics_prior,
+            self.latent_prior(older),
             self.settings.local_fit,
-            self.streams.under("local dynamics", environment.iteration),
+            self.streams.under("local dynamics", experience.iteration),
         )
         cost = self.fitted_cost(states)  # the quadratic cost of section 3
         update = improve_policy(  # line 8: POLICYUPDATE, section 4.2 and appendix A
-            previous.policy, dynamics.model, cost.model, self.max_kl(region), self.std_bounds
+            previous.policy, dynamics.model, cost.model, self.max_kl(region), self.std_bounds()
         )
-        return self.adopted(region, fit, previous, dynamics, cost, update)
+        promised = promised_fall(previous.policy, update.policy, dynamics.model, cost.model)
+        return {
+            **model,
+            **dynamics.metrics,
+            "cost_r2": cost.r2,
+            "cost_per_time": float(cost.per_time),
+            "linearisation_residual": previous.residual,
+            **self.adopt(region, promised, update),
+        }

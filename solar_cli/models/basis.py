@@ -12,8 +12,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from solar_cli.inference import mniw
-
 LEAST_SHARE = 1e-4  # of the largest eigenvalue: latents with less variance are noise
 
 
@@ -71,13 +69,3 @@ class LatentBasis(NamedTuple):
         R[latents, -1] = self.b
         R[rest, rest] = torch.eye(actions + 1).to(self.A)
         return R
-
-
-class LatentPrior(NamedTuple):
-    """What a representation knows of its dynamics."""
-
-    factor: mniw.RegressionStatistics | None
-    """q(F, Sigma) over [windows of latents; a; 1], or None for a representation without"""
-    basis: LatentBasis
-    latent: int
-    """d: entries of the newest block"""

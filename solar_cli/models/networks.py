@@ -30,21 +30,21 @@ which has to change by whole units within a training. It is held divided by this
 class SpatialSoftmaxLayer(nn.Module):
     """Expected coordinates (x, y) in [-1, 1] of each channel under a softmax over its pixels.
 
-    Finn et al. 2016, deep spatial auto-encoders, with a learned inverse temperature.
+    Finn et al. 2016, deep spatial auto-encoders, with a learned sharpness.
     """
 
     columns: Tensor
     rows: Tensor
 
-    def __init__(self, height: int, width: int, log_temperature: float) -> None:
+    def __init__(self, height: int, width: int, log_sharpness: float) -> None:
         super().__init__()
-        self.log_temperature = nn.Parameter(torch.tensor(log_temperature))
+        self.log_sharpness = nn.Parameter(torch.tensor(log_sharpness))
         self.register_buffer("columns", torch.linspace(-1, 1, width), persistent=False)
         self.register_buffer("rows", torch.linspace(1, -1, height), persistent=False)
 
     def forward(self, maps: Float[Tensor, "n c h w"]) -> Float[Tensor, "n two_c"]:
         """Coordinates of all channels: x of each, then y of each (up is positive)."""
-        share = (maps.flatten(2) * self.log_temperature.exp()).softmax(dim=-1).view_as(maps)
+        share = (maps.flatten(2) * self.log_sharpness.exp()).softmax(dim=-1).view_as(maps)
         x = (share.sum(dim=2) * self.columns).sum(dim=-1)
         y = (share.sum(dim=3) * self.rows).sum(dim=-1)
         return torch.cat([x, y], dim=-1)
@@ -128,7 +128,7 @@ def _image_layer(layer: Layer, shape: Shape) -> tuple[list[nn.Module], Shape]:
             width // factor,
         )
     if isinstance(layer, SpatialSoftmax):
-        return [SpatialSoftmaxLayer(height, width, layer.log_temperature)], (2 * channels,)
+        return [SpatialSoftmaxLayer(height, width, layer.log_sharpness)], (2 * channels,)
     if isinstance(layer, Deconv):
         deconv = nn.ConvTranspose2d(channels, layer.channels, layer.size, layer.stride)
         sides = [(side - 1) * layer.stride + layer.size for side in (height, width)]

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from solar_cli.inference import mniw, niw
+from solar_cli.models.basis import LatentBasis
 from solar_cli.settings import TaskSettings
 from solar_cli.settings.local import Dynamics
 
@@ -25,6 +26,16 @@ class Segments(NamedTuple):
     actions: Float[Tensor, "S L_1 a"]
     start: Int[Tensor, " S"]
     """time step of the first frame; 0 where an episode begins"""
+
+
+class LatentPrior(NamedTuple):
+    """What a representation knows of its dynamics, for INFERDYNAMICS."""
+
+    factor: mniw.RegressionStatistics | None
+    """q(F, Sigma) over [windows of latents; a; 1], or None for a representation without"""
+    basis: LatentBasis
+    latent: int
+    """d: entries of the newest block"""
 
 
 class Prior(Protocol):
@@ -41,8 +52,11 @@ class Prior(Protocol):
         """One natural-gradient step (Eq. 6); ``weights`` scale the segments to the whole data:
         one for transitions, one for starts of episodes."""
 
-    def condition(self, segments: Segments) -> None:
-        """The closed form: the exact posterior given ``segments`` as the whole data."""
+    def conclude(self, segments: Segments) -> None:
+        """End a training: the closed form given ``segments`` as the whole data."""
+
+    def given(self, segments: Segments) -> mniw.RegressionStatistics | None:
+        """The factor given ``segments`` alone; None for a prior without dynamics."""
 
     def metrics(self) -> dict[str, float]:
         """KL of the factors over parameters, in nats."""
@@ -66,8 +80,11 @@ class StandardNormal:
     def learn(self, segments: Segments, weights: tuple[float, float]) -> None:
         """Nothing to learn."""
 
-    def condition(self, segments: Segments) -> None:
+    def conclude(self, segments: Segments) -> None:
         """Nothing to learn."""
+
+    def given(self, segments: Segments) -> None:
+        """No dynamics."""
 
     def metrics(self) -> dict[str, float]:
         """No parameters."""
@@ -206,11 +223,19 @@ class LinearDynamics:
         )
 
     @torch.no_grad()
-    def condition(self, segments: Segments) -> None:
-        """The exact conjugate update: a natural-gradient step of rate 1 on the whole data."""
+    def conclude(self, segments: Segments) -> None:
+        """The exact conjugate update, a step of rate 1; or another step, where settings say so."""
+        if not self.settings.closed_form:
+            self.learn(segments, (1.0, 1.0))
+            return
         transitions, initial = self._statistics(segments)
         self.factor = self.prior.plus(transitions)
         self.initial = self.initial_prior.plus(initial)
+
+    @torch.no_grad()
+    def given(self, segments: Segments) -> mniw.RegressionStatistics:
+        """The exact posterior over (F, Sigma) given ``segments`` alone."""
+        return self.prior.plus(self._statistics(segments)[0])
 
     def metrics(self) -> dict[str, float]:
         """KL(q || p) of the factors over parameters: the last terms of the ELBO, in nats."""

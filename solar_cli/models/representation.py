@@ -7,7 +7,7 @@ most, and the best by held-out collected episodes is kept. Nothing here sees an 
 
 from __future__ import annotations
 
-import time
+import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -16,34 +16,34 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from solar_cli.episodes import Environment, Episodes, window_indices
-from solar_cli.models.basis import LatentBasis, LatentPrior
+from solar_cli.episodes import Episodes, Experience, window_indices
+from solar_cli.errors import UsageError
+from solar_cli.inference import mniw
+from solar_cli.models.basis import LatentBasis
 from solar_cli.models.frames import FrameModel
 from solar_cli.models.latent_model import LatentModel
 from solar_cli.models.likelihoods import explained_variance
-from solar_cli.models.priors import Prior
+from solar_cli.models.priors import LatentPrior, Prior, Segments
 from solar_cli.models.training import Trainer
 from solar_cli.pulse import Pulse
 from solar_cli.settings import TaskSettings
 from solar_cli.settings.local import LocalMethod
 from solar_cli.streams import Streams
 
-ACTIVE_SHARE = 0.1  # of a latent's variance that its mean must carry for it to count as active
+ACTIVE_SHARE = 0.9  # of a latent's variance that its mean must carry for it to count as active
 LEAST_EXPLAINED = 0.5  # of the variance of each channel
 LEAST_COST_R2 = 0.5
 
-CostScore = Callable[[Tensor, Episodes], float]
-"""R2 of the cost that control would fit on states (N, T+1, z) of these episodes."""
+CostScore = Callable[["Representation", Episodes, Episodes], float]
+"""R2 on the latter episodes of the cost that control would fit on the former."""
 
 
 class Candidate(NamedTuple):
     """One training of the representation, judged on held-out episodes."""
 
-    loss: float
-    """negative ELBO, nats a frame"""
-    healthy: bool
+    alive: bool
     metrics: dict[str, float]
-    state: dict[str, Any]
+    parameters: dict[str, Any]
 
 
 class Representation:
@@ -68,10 +68,17 @@ class Representation:
         self._cost_score = cost_score
         self._streams = streams
         self._pulse = pulse
+        window, length = task.observation.window, settings.training.length
+        if min(length, task.horizon + 1) <= window:
+            raise UsageError(
+                f"training.length = {length}, task.horizon = {task.horizon}: a segment and an "
+                f"episode must be longer than the observation window of {window}; change one"
+            )
         self._trainer = Trainer(settings.training, streams, device, pulse)
         self._model = self._untrained(0)
         self._basis: LatentBasis | None = None
         self._trained = False
+        self._before: Candidate | None = None  # what a fine-tuning under way started from
         self._candidates: list[Candidate] = []
 
     @property
@@ -85,10 +92,19 @@ class Representation:
         assert self._basis is not None
         return self._basis
 
-    @property
-    def dynamics_prior(self) -> LatentPrior:
-        """What the model knows of its dynamics, for INFERDYNAMICS."""
-        return LatentPrior(self._model.prior.factor, self.basis, self.latent)
+    def dynamics_prior(self, older: list[Episodes], *, as_it_stands: bool) -> LatentPrior:
+        """What the model knows of its dynamics, for INFERDYNAMICS, on the CPU.
+
+        Given ``older`` episodes, so that how much to trust it can be judged on the newest ones; or
+        as it stands, given all that it was trained on (section 4.1 as printed).
+        """
+        factor = self._model.prior.factor if as_it_stands else None
+        if older and not as_it_stands:
+            factor = self._model.prior.given(self._posterior(Episodes.joined(older)))
+        if factor is not None:
+            factor = mniw.RegressionStatistics(*(part.cpu() for part in factor))
+        basis = LatentBasis(*(part.cpu() for part in self.basis))
+        return LatentPrior(factor, basis, self.latent)
 
     @property
     def latent(self) -> int:
@@ -100,29 +116,18 @@ class Representation:
         """z: entries of a state."""
         return self.latent * self.task.observation.window
 
-    def update(self, environment: Environment) -> dict[str, float]:
+    def update(self, experience: Experience) -> dict[str, float]:
         """MODELUPDATE (Algorithm 1, line 5): train on the batches of the last B iterations."""
-        recent = environment.recent(self.settings.training.buffer)
-        newest = recent[-1]
-        started = time.perf_counter()
-        steps = self.settings.training.fine_tune_steps
-        if not self.trained:
-            metrics = self._train_first(newest)
-            self.moved = True
-        elif steps:
-            name = f"iteration {environment.iteration}"
-            metrics = self._trainer.fit(name, self._model, recent, steps, fine_tuning=True)
-            metrics |= self._judge(newest)
-            self.moved = True
+        recent = experience.recent(self.settings.training.buffer)
+        self.moved = False
+        if not self._trained:
+            metrics = self._train_first(recent[-1])
+        elif self.settings.training.fine_tune_steps:
+            metrics = self._fine_tune(experience.iteration, recent)
         else:
-            self._model.prior.condition(self._model.posterior(Episodes.joined(recent), self.device))
-            metrics = self._judge(newest)
-            self.moved = False
-        return {
-            **metrics,
-            **self._model.prior.metrics(),
-            "seconds_model": time.perf_counter() - started,
-        }
+            metrics = self._judge(recent[-1])
+            self._model.prior.conclude(self._posterior(Episodes.joined(recent)))
+        return {**metrics, **self._model.prior.metrics()}
 
     def _train_first(self, episodes: Episodes) -> dict[str, float]:
         """Train until a representation is alive, or take the best of the attempts."""
@@ -134,60 +139,79 @@ class Representation:
             if not self._trainer.under_way:
                 self._model = self._untrained(attempt)
                 self._model.networks.standardise_by(self._frames(learned))
-            started = time.perf_counter()
-            terms = self._trainer.fit(f"attempt {attempt}", self._model, [learned], training.steps)
+            name = f"attempt {attempt}"
+            terms = self._trainer.fit(name, self._model, [learned], training.steps)
             self._basis = self._whitening(learned)
             metrics = self._judge(held_out)
-            self._candidates.append(
-                Candidate(
-                    loss=metrics["held_out_loss"],
-                    healthy=metrics["healthy"] == 1.0,
-                    metrics={**terms, **metrics, "seconds_training": time.perf_counter() - started},
-                    state=self._parameters(),
-                )
+            metrics["held_out_cost_r2"] = self._cost_score(self, learned, held_out)
+            alive = self._alive(metrics) and metrics["held_out_cost_r2"] >= LEAST_COST_R2
+            self._candidates.append(Candidate(alive, {**terms, **metrics}, self._parameters()))
+        best = max(self._candidates, key=lambda c: (c.alive, c.metrics["held_out_elbo"]))
+        if not best.alive:
+            warnings.warn(
+                f"no representation of {len(self._candidates)} is alive; going on with the best: "
+                f"it explains {best.metrics['least_explained_variance']:.0%} of a channel",
+                stacklevel=2,
             )
-        best = min(self._candidates, key=lambda c: (not c.healthy, c.loss))
         seconds = sum(candidate.metrics["seconds_training"] for candidate in self._candidates)
         discarded = {
+            "alive": float(best.alive),
             "discarded_trainings": len(self._candidates) - 1.0,
             "seconds_discarded": seconds - best.metrics["seconds_training"],
         }
-        self._take_up(best.state)
-        self._trained = True
+        self._take_up(best.parameters)
+        self._trained = self.moved = True
         self._candidates = []
         return {**best.metrics, **discarded}
 
     def _found(self) -> bool:
-        return any(candidate.healthy for candidate in self._candidates)
+        return any(candidate.alive for candidate in self._candidates)
+
+    def _fine_tune(self, iteration: int, recent: list[Episodes]) -> dict[str, float]:
+        """Train further on the last batches; taken back if it kills what was alive."""
+        newest, steps = recent[-1], self.settings.training.fine_tune_steps
+        if not self._trainer.under_way or self._before is None:
+            self._before = Candidate(True, self._judge(newest), self._parameters())
+        before = self._before
+        name = f"iteration {iteration}"
+        terms = self._trainer.fit(name, self._model, recent, steps, fine_tuning=True)
+        self._before = None
+        self.moved = not self._alive(before.metrics) or self._alive(self._judge(newest))
+        if not self.moved:
+            self._take_up(before.parameters)
+        return {**terms, **before.metrics, "fine_tuning_taken_back": float(not self.moved)}
+
+    @staticmethod
+    def _alive(metrics: dict[str, float]) -> bool:
+        """Whether every channel is reconstructed and something is encoded."""
+        explained = metrics["least_explained_variance"] >= LEAST_EXPLAINED
+        return explained and metrics["active_latents"] >= 1
 
     @torch.no_grad()
     def _judge(self, episodes: Episodes) -> dict[str, float]:
-        """What there is to watch, on episodes that count: ELBO, live latents, explained pixels."""
-        model, basis = self._model, self.basis
-        segments = model.posterior(episodes, self.device)
+        """What there is to watch, on collected episodes that the model has not been trained on."""
+        model = self._model
+        segments = self._posterior(episodes)
+        mean, variance = segments.mean.flatten(0, 1), segments.variance.flatten(0, 1)
         scaled = model.networks.scaled(self._frames(episodes))
-        means = segments.mean.flatten(0, 1)
-        reconstruction = model.networks.reconstruction_loss(means.float(), scaled)
+        draws = self._streams.generator("judging").standard_normal(mean.shape)
+        sample = mean + variance.sqrt() * torch.from_numpy(draws).to(mean)
+        reconstruction = model.networks.reconstruction_loss(sample.float(), scaled)
         kl = model.prior.kl(segments)
         explained = explained_variance(model.networks.reconstruct(scaled), scaled)
-        spread = means.var(dim=0)
-        share = spread / (spread + segments.variance.flatten(0, 1).mean(dim=0))
-        r2 = self._cost_score(basis.state(self._windows(segments.mean)), episodes)
-        least = float(explained.min())
+        spread = mean.var(dim=0)
+        carried = spread / (spread + variance.mean(dim=0))
         return {
-            "held_out_loss": float(reconstruction) + float(kl),
+            "held_out_elbo": -float(reconstruction) - float(kl),
             "held_out_kl": float(kl),
-            "explained_variance": least,
-            "active_latents": float((share > 1 - ACTIVE_SHARE).sum()),
-            "latent_cost_r2": r2,
-            "healthy": float(least >= LEAST_EXPLAINED and r2 >= LEAST_COST_R2),
+            "least_explained_variance": float(explained.min()),
+            "active_latents": float((carried >= ACTIVE_SHARE).sum()),
         }
 
     @torch.no_grad()
     def embed(self, episodes: Episodes) -> Float[Tensor, "N T1 z"]:
         """States of every step, by the encoder's mean; each frame is encoded once."""
-        mean = self._model.posterior(episodes, self.device).mean
-        return self.basis.state(self._windows(mean))
+        return self.basis.state(self._windows(self._posterior(episodes).mean))
 
     @torch.no_grad()
     def encode(self, frames: np.ndarray[Any, Any]) -> Float[Tensor, "n d"]:
@@ -210,6 +234,7 @@ class Representation:
             "trainer": self._trainer.state_dict(),
             "candidates": [tuple(candidate) for candidate in self._candidates],
             "trained": self._trained,
+            "before": None if self._before is None else tuple(self._before),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -218,6 +243,7 @@ class Representation:
         self._trainer.load_state_dict(state["trainer"])
         self._candidates = [Candidate(*candidate) for candidate in state["candidates"]]
         self._trained = state["trained"]
+        self._before = None if state["before"] is None else Candidate(*state["before"])
 
     def _untrained(self, attempt: int) -> LatentModel:
         """Fresh networks whose weights depend on the seed and the attempt only."""
@@ -227,6 +253,9 @@ class Representation:
         return LatentModel(
             networks.to(self.device), self._make_prior(), self.settings.training.standard_normal
         )
+
+    def _posterior(self, episodes: Episodes) -> Segments:
+        return self._model.posterior(episodes, self.device)
 
     def _frames(self, episodes: Episodes) -> Tensor:
         frames = torch.from_numpy(np.ascontiguousarray(episodes.frames))
@@ -238,7 +267,7 @@ class Representation:
         return latents[:, torch.from_numpy(index[:, ::-1].copy()).to(latents.device)]
 
     def _whitening(self, episodes: Episodes) -> LatentBasis:
-        mean = self._model.posterior(episodes, self.device).mean
+        mean = self._posterior(episodes).mean
         return LatentBasis.whitening(self._windows(mean).flatten(0, 1))
 
     def _parameters(self) -> dict[str, Any]:

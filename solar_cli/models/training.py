@@ -7,6 +7,7 @@ and `Trainer.state_dict` holds the rest.
 from __future__ import annotations
 
 import math
+import time
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from solar_cli.episodes import Episodes
 from solar_cli.models.latent_model import LatentModel, Minibatch
+from solar_cli.models.priors import Segments
 from solar_cli.pulse import Diverged, Pulse
 from solar_cli.settings.local import Training
 from solar_cli.streams import Streams
@@ -43,51 +45,60 @@ class Trainer:
         *,
         fine_tuning: bool = False,
     ) -> dict[str, float]:
-        """Train for ``steps`` steps, then condition the prior on all data; smoothed ELBO terms.
+        """Train for ``steps`` steps, then conclude with all data; smoothed ELBO terms.
 
         ``name`` keys the run's random draws; a run of that name that was interrupted goes on.
         When fine-tuning, half of the segments come from the newest batch.
         """
         data = Dataset(batches, self.device)
-        networks = model.networks
         optimiser = torch.optim.Adam(
-            networks.parameters(), lr=self.settings.learning_rate, fused=True
+            model.networks.parameters(), lr=self.settings.learning_rate, fused=True
         )
         if self._running is None or self._running["name"] != name:
-            self._running = {"name": name, "step": 0, "terms": {}}
+            self._running = {"name": name, "step": 0, "terms": {}, "seconds": 0.0}
         elif "optimiser" in self._running:
             optimiser.load_state_dict(self._running.pop("optimiser"))
         self._optimiser = optimiser
-        running = self._running
+        running, last = self._running, time.perf_counter()
         while running["step"] < steps:
-            step = int(running["step"])
-            share = step / steps
+            share = running["step"] / steps
             for group in optimiser.param_groups:
                 group["lr"] = self._rate(share, fine_tuning)
-            batch = data.minibatch(
-                self.settings,
-                self.streams.generator("minibatch", name, step),
-                networks.settings.latent,
-                fine_tuning,
-            )
+            draws = self.streams.generator("minibatch", name, running["step"])
+            latent = model.networks.settings.latent
+            batch = data.minibatch(self.settings, draws, latent, fine_tuning)
             weight = self.settings.kl_end if fine_tuning else self._kl_weight(share)
-            loss, segments, terms = model.loss(batch, weight)
-            optimiser.zero_grad()
-            torch.autograd.backward(loss)
-            torch.nn.utils.clip_grad_norm_(networks.parameters(), self.settings.clip)
-            optimiser.step()
-            model.prior.learn(
-                type(segments)(*(part.detach() for part in segments)), data.weights(batch)
-            )
-            running["step"] = step + 1
+            loss, terms = self._step(model, optimiser, batch, weight, data.weights(batch))
+            running["step"] += 1
             self._smooth(running["terms"], terms)
-            if (step + 1) % PULSE_STEPS == 0:
-                if not math.isfinite(float(loss.detach())):
-                    raise Diverged(f"the model's loss is not finite at step {step + 1} of {name}")
-                self.pulse(f"training the model ({name})", (step + 1) / steps)
+            if running["step"] % PULSE_STEPS == 0:
+                if not math.isfinite(float(loss)):
+                    raise Diverged(f"the loss at step {running['step']} of {name} is not finite")
+                running["seconds"] += time.perf_counter() - last
+                last = time.perf_counter()
+                self.pulse(f"training the model ({name})", running["step"] / steps)
         self._running = self._optimiser = None
-        model.prior.condition(data.posterior(model))
-        return {name: float(value) for name, value in running["terms"].items()}
+        model.prior.conclude(data.posterior(model))
+        seconds = running["seconds"] + time.perf_counter() - last
+        smoothed = {name: float(value) for name, value in running["terms"].items()}
+        return {**smoothed, "seconds_training": seconds}
+
+    def _step(
+        self,
+        model: LatentModel,
+        optimiser: torch.optim.Adam,
+        batch: Minibatch,
+        kl_weight: float,
+        weights: tuple[float, float],
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """A step of Adam on the networks and one of natural gradient on the prior."""
+        loss, segments, terms = model.loss(batch, kl_weight)
+        optimiser.zero_grad()
+        torch.autograd.backward(loss)
+        torch.nn.utils.clip_grad_norm_(model.networks.parameters(), self.settings.clip)
+        optimiser.step()
+        model.prior.learn(Segments(*(part.detach() for part in segments)), weights)
+        return loss.detach(), terms
 
     def _rate(self, share: float, fine_tuning: bool) -> float:
         if fine_tuning:
@@ -169,13 +180,14 @@ class Dataset:
     def weights(self, batch: Minibatch) -> tuple[float, float]:
         """B of Eq. 6: how many times a minibatch goes into the data, by transitions and by starts.
 
-        A segment starts an episode with probability 1 / (T - L + 2).
+        L frames hold L - W transitions between windows of W; a segment starts an episode with
+        probability 1 / (T - L + 2).
         """
         segments, length = batch.frames.shape[:2]
-        count, horizon = len(self.episodes), self.episodes.horizon
-        transitions = count * horizon / (segments * (length - 1))
+        count, horizon, window = len(self.episodes), self.episodes.horizon, self.episodes.window
+        transitions = count * (horizon + 1 - window) / (segments * (length - window))
         return transitions, count * (horizon - length + 2) / segments
 
-    def posterior(self, model: LatentModel) -> Any:
+    def posterior(self, model: LatentModel) -> Segments:
         """q(z | s) of every episode."""
         return model.posterior(self.episodes, self.device)

@@ -14,7 +14,7 @@ from solar_cli.reporting.tables import number
 from solar_cli.store.store import Store
 
 SPLITS = ("train", "model")
-HEALTHY = "healthy"
+ALIVE = "alive"
 """Metric of a method that judges its own representation: 1, or 0 for a dead or collapsed one."""
 SPARK_WIDTH, SPARK_HEIGHT = 100, 20
 
@@ -48,7 +48,7 @@ class Chart:
     @property
     def warnings(self) -> list[str]:
         """One line for each curve with a seed whose method calls its representation unhealthy."""
-        verdicts = dict(self.rows).get(HEALTHY, ())
+        verdicts = dict(self.rows).get(ALIVE, ())
         return [
             f"{label}: the representation of at least one seed is not healthy"
             for label, vital in zip(self.labels, verdicts, strict=False)

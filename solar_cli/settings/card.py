@@ -113,19 +113,44 @@ def _read(path: Path) -> Card:
             f"card {path}: a task's name has lower-case letters, digits, '-', '_' and '.' only; "
             "rename the file"
         )
-    try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8"))
-    except tomllib.TOMLDecodeError as error:
-        raise UsageError(f"card {path}: not valid TOML: {error}; correct that line") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"card {path}: cannot be read ({error}); name a readable file") from error
+    tables = _toml(path)
+    if "extends" in tables:
+        tables = _extended(tables, path)
     card = Card(path.stem, path, tables)
     _validated(CardTables, tables, f"card {path}")
     for variant in card.variants:
         for name in tables.get("methods", {}):
-            if name in method_names():  # others come with packages that are not installed here
+            # Methods of packages that are not installed here are left to those who have them.
+            if name in method_names() and _changes(card, variant, name):
                 resolve(card, name, variant)
     return card
+
+
+def _toml(path: Path) -> Table:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise UsageError(f"card {path}: not valid TOML: {error}; correct that line") from error
+    except (OSError, UnicodeDecodeError, RecursionError) as error:
+        raise UsageError(f"card {path}: cannot be read ({error}); name a readable file") from error
+
+
+def _extended(tables: Table, path: Path) -> Table:
+    """The card beside this one, or known by name, that ``extends`` names, with these laid over."""
+    name = tables.pop("extends")
+    folders = [path.parent, *card_folders()]
+    bases = [folder / f"{name}.toml" for folder in folders] if isinstance(name, str) else []
+    base = next((base for base in bases if base.is_file()), None)
+    if base is None or name == path.stem:
+        raise UsageError(
+            f"card {path}: 'extends' must be the name of another card, not {name!r}: "
+            f"{nearest(str(name), set(card_names()) - {path.stem})}"
+        )
+    whole = _toml(base)
+    if "extends" in whole:
+        raise UsageError(f"card {path}: {name!r} extends a card itself; extend that one instead")
+    _merge(whole, tables)
+    return whole
 
 
 def resolve(
@@ -141,7 +166,13 @@ def resolve(
         raise UsageError(
             f"task {card.name!r} has no variant {variant!r}: {nearest(variant, card.variants)}"
         )
-    layers = [("card", card.tables), (f"variant {variant}", _variant(card, variant))]
+    if not _changes(card, variant, method_name):
+        raise UsageError(
+            f"variant {variant!r} of task {card.name!r} changes nothing for {method_name!r}: "
+            "leave --variant out"
+        )
+    layers = [("card", _with_method(card, method_name))]
+    layers += [(f"variant {variant}", _variant(card, variant))]
     layers += [("--set", assignment(text)) for text in sets]
     merged: Table = {}
     origins: dict[str, str] = {}
@@ -166,6 +197,28 @@ def resolve(
             f"task {card.name!r} gives {configuration.task.observation.kind}: choose another"
         )
     return Resolved(configuration, origins)
+
+
+def _changes(card: Card, variant: str, method_name: str) -> bool:
+    """Whether a variant says anything that concerns a method: a second name is no variant."""
+    overrides = _variant(card, variant)
+    shared = set(overrides) - {"methods"}
+    return variant == "default" or bool(shared) or method_name in overrides.get("methods", {})
+
+
+def _with_method(card: Card, method_name: str) -> Table:
+    """The card's tables, a method that is ``like`` another one with the other's below its own."""
+    methods: Table = card.tables.get("methods", {})
+    own = deepcopy(methods.get(method_name, {}))
+    like = own.pop("like", None)
+    if like is not None and (not isinstance(like, str) or like not in methods):
+        raise UsageError(
+            f"card {card.path}: methods.{method_name}.like = {like!r}: "
+            f"{nearest(str(like), set(methods) - {method_name})}"
+        )
+    table = deepcopy(methods[like]) if like else {}
+    _merge(table, own)
+    return {**card.tables, "methods": {**methods, method_name: table}}
 
 
 def _variant(card: Card, variant: str) -> Table:

@@ -13,7 +13,7 @@ from typing import Any, Literal
 from solar_cli.errors import UsageError
 from solar_cli.settings.card import NAME, Card, Configuration, resolve
 from solar_cli.settings.registry import method, settings_class
-from solar_cli.settings.schema import hashed_values
+from solar_cli.settings.schema import completed, hashed_values
 from solar_cli.settings.task import EvaluationSettings, TaskSettings
 
 MOST_SEEDS = 10_000
@@ -74,11 +74,14 @@ class Cell:
 
 
 def restore(task: str, method_name: str, variant: str, seed: int, config: dict[str, Any]) -> Cell:
-    """The cell of a stored configuration; settings that came later take their defaults."""
+    """The cell of a stored configuration; settings that came later are as they were in effect."""
+    learner = settings_class(method(method_name))
     configuration = Configuration.model_construct(
-        task=TaskSettings.model_validate(config["task"]),
-        evaluation=EvaluationSettings.model_validate(config["evaluation"]),
-        method=settings_class(method(method_name)).model_validate(config["method"]),
+        task=TaskSettings.model_validate(completed(TaskSettings, config["task"])),
+        evaluation=EvaluationSettings.model_validate(
+            completed(EvaluationSettings, config["evaluation"])
+        ),
+        method=learner.model_validate(completed(learner, config["method"])),
     )
     return Cell(task, method_name, variant, seed, configuration)
 

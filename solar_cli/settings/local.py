@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
 
 from solar_cli.settings.networks import FULLY_CONNECTED, KEY_POINTS, Layer
 from solar_cli.settings.schema import Settings, setting
+
+Positive = Annotated[float, Field(gt=0)]
 
 
 class Budget(Settings):
@@ -33,7 +37,7 @@ class Representation(Settings):
     head: Literal["linear", "none"] = setting(
         "linear", "linear map from the last layer to the latent mean, or the layer itself"
     )
-    variance: float | Literal["learned"] = setting(
+    variance: Positive | Literal["learned"] = setting(
         "learned", "variance of q(z|s): a learned diagonal, or this number"
     )
     decoder: tuple[Layer, ...] = setting(FULLY_CONNECTED, "hidden layers of the observation model")
@@ -63,7 +67,10 @@ class Dynamics(Settings):
     )
     prior_scale: float = setting(1e-3, "Psi_0 = this x (nu_0 + d + 1) I, nu_0 = d + 2", gt=0)
     prior_precision: float = setting(1e-2, "V_0^-1 = this x I", gt=0)
-    rate: float = setting(0.02, "natural-gradient step (Eq. 6); 1 is the closed form", gt=0, le=1)
+    rate: float = setting(0.02, "natural-gradient step of each minibatch (Eq. 6)", gt=0, le=1)
+    closed_form: bool = setting(
+        True, "end a training with the exact posterior: a step of rate 1 on the whole data"
+    )
 
 
 class Training(Settings):
@@ -94,27 +101,34 @@ class LocalFit(Settings):
     method: Literal["posterior", "regression", "gmm"] = setting(
         "posterior", "posterior inference; least squares; a Gaussian-mixture prior (LQR-FLM)"
     )
-    prior_counts: tuple[float, ...] = setting(
-        (1.0, 10.0, 100.0), "pseudo-counts of the global factor, chosen by held-out likelihood"
+    prior_counts: tuple[float, ...] | Literal["own"] = setting(
+        (0.0, 1.0, 10.0, 100.0),
+        "pseudo-counts of the model's factor given older batches, chosen by held-out likelihood; "
+        "or the factor as it stands (section 4.1)",
+        min_length=1,
     )
     widths: tuple[float, ...] = setting(
-        (2.0, 5.0), "reach of neighbouring time steps, chosen by held-out likelihood"
+        (2.0, 5.0), "reach of neighbouring time steps, chosen by held-out likelihood", min_length=1
     )
     neighbours: tuple[float, ...] = setting(
-        (0.0, 0.5), "weight of neighbouring time steps, chosen by held-out likelihood"
+        (0.0, 0.5), "weight of neighbouring time steps, chosen by held-out likelihood", min_length=1
     )
     older_counts: tuple[float, ...] = setting(
-        (0.0, 10.0), "pseudo-counts of older batches, chosen by held-out likelihood"
+        (0.0, 10.0), "pseudo-counts of older batches, chosen by held-out likelihood", min_length=1
     )
     older_batches: int = setting(3, "older batches that may be used", ge=0)
     folds: int = setting(3, "folds of the held-out likelihood", ge=2)
-    ridge: float = setting(0.003, "noise of a latent, in units of its std, that slopes must bear")
+    ridge: float = setting(
+        0.003, "noise of a latent, in units of its std, that slopes must bear", gt=0
+    )
 
 
 class CostFit(Settings):
     """c_t = 1/2 z^T L L^T z + c^T z + alpha |a|^2 + b (section 3)."""
 
-    optimiser: Literal["lbfgs", "sgd"] = setting("lbfgs", "of the squared error")
+    optimiser: Literal["lbfgs", "sgd"] = setting(
+        "lbfgs", "of the squared error; sgd is full-batch descent with momentum"
+    )
     width: float = setting(5.0, "reach in time steps of a per-time fit", gt=0)
     per_time: Literal["chosen", "never"] = setting(
         "chosen", "a fit per time step where held-out R2 says so, or never"
@@ -125,19 +139,27 @@ class CostFit(Settings):
 class PolicyUpdate(Settings):
     """KL-constrained LQR and the rules around it (section 4.2)."""
 
-    kl_step: float | Literal["unbounded"] = setting(
+    kl_step: Positive | Literal["unbounded"] = setting(
         0.5, "nats a time step that the trajectory distribution may move"
     )
-    multiplier: tuple[float, float] = setting((0.3, 2.0), "bounds of the adaptive step size")
+    multiplier: tuple[Positive, Positive] = setting((0.3, 2.0), "bounds of the adaptive step size")
     linearise: bool = setting(True, "line 6 of Algorithm 1, when e(s) has changed")
-    reject: float | Literal["never"] = setting(
+    reject: Annotated[float, Field(ge=0)] | Literal["never"] = setting(
         1.0, "standard errors by which a batch may be worse than the best before going back"
     )
-    std_floor: tuple[float, float] = setting(
+    std_floor: tuple[Positive, Positive] = setting(
         (0.67, 0.33), "least std over the initial one: first updates, later ones"
     )
     std_ceiling: float = setting(2.0, "largest std over the initial one", gt=0)
     early_updates: int = setting(3, "updates that the first floor holds for", ge=0)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.multiplier[0] > self.multiplier[1]:
+            raise ValueError("multiplier: the lower bound is above the upper one")
+        if max(self.std_floor) > self.std_ceiling:
+            raise ValueError("std_floor: a floor is above std_ceiling")
+        return self
 
 
 class LocalMethod(Settings):
@@ -161,4 +183,5 @@ class Solar(LocalMethod):
 class Vae(LocalMethod):
     """The VAE ablation: a standard-normal prior, local dynamics with a Gaussian-mixture prior."""
 
+    training: Training = setting(Training(standard_normal=0.0), "line 5 of Algorithm 1")
     local_fit: LocalFit = setting(LocalFit(method="gmm"), "line 7 of Algorithm 1")

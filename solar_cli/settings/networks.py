@@ -33,7 +33,7 @@ class SpatialSoftmax(Settings):
     """Expected image coordinates of every channel, in [-1, 1] (Finn et al. 2016)."""
 
     kind: Literal["spatial_softmax"] = "spatial_softmax"
-    log_temperature: float = setting(1.0, "initial log of the inverse temperature, learned")
+    log_sharpness: float = setting(1.0, "initial log of the factor on the maps, learned")
 
 
 class Linear(Settings):
@@ -76,7 +76,7 @@ KEY_POINTS: tuple[Layer, ...] = (
     Conv(channels=16, size=3, padding=1),
     Conv(channels=16, size=3, padding=1),
     Conv(channels=32, size=1, activation="none"),
-    SpatialSoftmax(log_temperature=1.0),
+    SpatialSoftmax(log_sharpness=1.0),
 )
 """Our encoder for every image task: key points of a frame at a quarter of its resolution."""
 

@@ -14,7 +14,8 @@ from scipy import stats
 from solar_cli.control.local_dynamics import ACTION_RIDGE, infer_dynamics
 from solar_cli.control.trajectories import Trajectories
 from solar_cli.inference import mniw
-from solar_cli.models.basis import LatentBasis, LatentPrior
+from solar_cli.models.basis import LatentBasis
+from solar_cli.models.priors import LatentPrior
 from solar_cli.settings.local import LocalFit
 from solar_cli.streams import Streams
 

@@ -10,14 +10,14 @@ from solar_cli.store.store import Store
 
 
 def fingerprint(store: Store, cell: str) -> dict[str, str]:
-    """SHA-256 of the metric rows and of the learner's final state; wall-clock is left out."""
+    """SHA-256 of the metric rows and of the learner's final state; time and memory are left out."""
     return {"metrics": metric_digest(store, cell), "state": state_digest(store, cell)}
 
 
 def metric_digest(store: Store, cell: str, splits: tuple[str, ...] = ()) -> str:
     digest = hashlib.sha256()
     for row in store.metrics(hashes=[cell], splits=splits, values=True):
-        if row["name"].startswith("seconds"):
+        if row["name"].startswith(("seconds", "peak_memory")):
             continue
         values = row["values"]
         parts = [row[key] for key in ("iteration", "episodes", "steps", "split", "name", "kind")]

@@ -1,6 +1,5 @@
 """The fake method, registered as any other package's would be; cells and attempts of it."""
 
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from solar_cli.store.store import Store
 HERE = Path(__file__).parent
 
 
-@pytest.fixture(scope="session", autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def fake_package(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Installs the fake method; the value of PYTHONPATH with which workers find it too."""
     torch.set_num_threads(1)  # as in a worker
@@ -31,7 +30,6 @@ def fake_package(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         registry._known.cache_clear()
         yield path
     registry._known.cache_clear()
-    sys.modules.pop("fake_method", None)
 
 
 @pytest.fixture

@@ -153,7 +153,9 @@ def test_a_cell_that_was_taken_over_is_left_to_its_new_owner(
     store: Store, stub: Callable[..., list[Result]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(supervision, "BEAT_SECONDS", 0.0)
+    started = time.monotonic()
     [result] = stub("taken")
+    assert time.monotonic() - started < 40  # its worker, which would go on for a minute, is killed
     assert result.outcome is None
     assert not result.finished
     assert len(store.attempts(result.plan.cell.hash)) == 2

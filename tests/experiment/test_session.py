@@ -10,6 +10,7 @@ import pytest
 from bits import files_of, fingerprint, metric_digest, state_digest
 
 from solar_cli.envs.task import RowTask
+from solar_cli.episodes import Environment
 from solar_cli.errors import SolarError
 from solar_cli.experiment import checkpointing, session
 from solar_cli.experiment.judge import Judge
@@ -272,19 +273,28 @@ def test_a_checkpoint_that_does_not_fit_the_code_says_what_to_do(
 
 
 def test_two_newest_checkpoints_and_the_best_by_training_cost_are_kept(
-    store: Store, cell: Cell
+    store: Store, cell: Cell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    def best_at_four(self: Environment, iteration: int) -> dict[str, float]:
+        return {"return": -abs(iteration - 4.0)}
+
+    monkeypatch.setattr(Environment, "summary", best_at_four)
     attempt(store, cell, target=32, every=1e9)
-    returns = {
-        row["iteration"]: row["value"]
-        for row in store.metrics(hashes=[cell.hash], names=["return"], splits=["train"])
-    }
-    best = max(returns, key=lambda iteration: returns[iteration])
-    # Iteration k is collected by the policy of the checkpoint of iteration k - 1.
-    expected = {8, 7, best - 1} - {0}
+    # Iteration 4 is collected by the policy of the checkpoint of iteration 3.
     records = store.checkpoints(cell.hash)
-    assert {record.iteration for record in records} == expected
+    assert [record.iteration for record in records] == [8, 7, 3]
     assert files_of(store, cell.hash) == {store.folder(cell.hash) / r.path for r in records}
+
+
+def test_evaluation_episodes_are_none_that_were_learned_from(store: Store, cell: Cell) -> None:
+    made = attempt(store, cell, every=1e9)
+    judge, policy = Judge(cell), made.learner.policy
+    collected = [made.environment.collected(iteration)[0] for iteration in (1, 2)]
+    judged = [judge.evaluate(policy, iteration).episodes for iteration in (0, 1, 2)]
+    starts = [episodes.frames[i, 0].tobytes() for episodes in (*collected, *judged) for i in (0, 1)]
+    assert len(set(starts)) == len(starts)
+    again = judge.evaluate(policy, 1).episodes
+    np.testing.assert_array_equal(again.frames, judged[1].frames)
 
 
 @pytest.mark.parametrize(("trouble", "word"), [("diverge", "told to"), ("nan", "evaluation")])

@@ -153,18 +153,6 @@ def test_a_cost_that_is_not_finite_is_divergence(tmp_path, name, value, iteratio
         run.iterate(iteration, iteration)
 
 
-def test_a_noisy_cost_that_is_not_finite_is_divergence_too(tmp_path):
-    """Judged by episodes without noise, learned from those with it."""
-
-    def change(costs):
-        return costs * math.inf if len(costs) == 4 else costs
-
-    batches = "batches={ initial = 8, noisy = 4, noise_free = 3 }"
-    run = Run(tmp_path, "solar", batches, costs=of_iteration(2, change)).iterate(1, 1)
-    with pytest.raises(Diverged):
-        run.iterate(2, 2)
-
-
 def test_a_policy_that_is_not_finite_is_divergence(tmp_path, monkeypatch):
     improve = solar.improve_policy
 

@@ -36,7 +36,7 @@ def minibatch(seed=1, segments=3, length=4, decoded=(0, 3, 5, 11)) -> Minibatch:
 
 
 def taught(model: LatentModel) -> LatentModel:
-    model.prior.condition(model.posterior(vector_episodes(TASK, 6), "cpu"))
+    model.prior.conclude(model.posterior(vector_episodes(TASK, 6), "cpu"))
     return model
 
 

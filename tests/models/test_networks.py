@@ -108,10 +108,8 @@ def test_a_deconvolution_lays_its_filter_where_every_pixel_points(shape, image, 
 # Spatial softmax: x is to the right, y is up, both within [-1, 1]
 
 
-def softmax(log_temperature=0.0, shape=(1, 5, 9)):
-    layers = LAYERS.validate_python(
-        [{"kind": "spatial_softmax", "log_temperature": log_temperature}]
-    )
+def softmax(log_sharpness=0.0, shape=(1, 5, 9)):
+    layers = LAYERS.validate_python([{"kind": "spatial_softmax", "log_sharpness": log_sharpness}])
     module, out = build(layers, shape)
     assert out == (2 * shape[0],)
     return module
@@ -142,13 +140,13 @@ def test_a_flat_map_is_at_the_middle():
     )
 
 
-@pytest.mark.parametrize("log_temperature", [-1.0, 0.0, 1.5])
-def test_the_temperature_is_that_of_a_softmax(log_temperature):
+@pytest.mark.parametrize("log_sharpness", [-1.0, 0.0, 1.5])
+def test_the_sharpness_is_the_factor_on_the_maps(log_sharpness):
     maps = torch.full((1, 1, 1, 7), -torch.inf)
     maps[..., 0], maps[..., -1] = 0.2, 0.9
     # Two pixels at -1 and 1: the mean of a two-way softmax is a hyperbolic tangent.
-    expected = math.tanh(math.exp(log_temperature) * (0.9 - 0.2) / 2)
-    found = softmax(log_temperature, (1, 1, 7))(maps)[0, 0].detach()
+    expected = math.tanh(math.exp(log_sharpness) * (0.9 - 0.2) / 2)
+    found = softmax(log_sharpness, (1, 1, 7))(maps)[0, 0].detach()
     assert float(found) == pytest.approx(expected, abs=1e-6)
 
 
@@ -159,7 +157,7 @@ def test_coordinates_are_x_of_all_channels_then_y_of_all():
     torch.testing.assert_close(softmax(shape=(2, 5, 9))(maps), expected, rtol=0, atol=1e-6)
 
 
-def test_the_temperature_is_learned():
+def test_the_sharpness_is_learned():
     module = softmax(0.5)
     [parameter] = module.parameters()
     module(batch(1, 5, 9)).square().sum().backward()

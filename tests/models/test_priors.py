@@ -130,7 +130,7 @@ def expected_total(prior_settings, learned_from, judged, window):
 def test_kl_is_that_of_a_dense_loop(factors, rows, window):
     prior = dynamics(factors, rows, window)
     learned = whole_episodes(1)
-    prior.condition(learned)
+    prior.conclude(learned)
     judged = made_up_segments(2, [0, 1, 0], T, d, a)
     expected = expected_total(prior.settings, learned, judged, window)
     assert float(prior.kl(judged)) == pytest.approx(expected, rel=1e-9)
@@ -138,7 +138,7 @@ def test_kl_is_that_of_a_dense_loop(factors, rows, window):
 
 def test_segments_inside_an_episode_have_no_initial_term():
     prior = dynamics()
-    prior.condition(whole_episodes(1))
+    prior.conclude(whole_episodes(1))
     judged = made_up_segments(2, [1, 2], 4, d, a)
     expected = expected_total(prior.settings, whole_episodes(1), judged, 1)
     assert float(prior.kl(judged)) == pytest.approx(expected, rel=1e-9)
@@ -146,7 +146,7 @@ def test_segments_inside_an_episode_have_no_initial_term():
 
 def test_kl_is_a_mean_over_draws_of_dynamics_and_latents():
     prior, segments = dynamics(), made_up_segments(3, [0], 3, d, a)
-    prior.condition(whole_episodes(1))
+    prior.conclude(whole_episodes(1))
     learned = whole_episodes(1)
     samples = [s for _, _, *s in transitions(learned, 1, "newest")]
     Psi, nu, M, V = bayesian_regression(samples, d, d + a + 1, prior.settings)
@@ -188,7 +188,7 @@ def _gaussian_kl(mean, variance, centres, covariances):
 @every_form
 def test_gradients_are_those_of_finite_differences(factors, rows, window):
     prior = dynamics(factors, rows, window)
-    prior.condition(whole_episodes(1))
+    prior.conclude(whole_episodes(1))
     judged = made_up_segments(2, [0, 1], window + 2, d, a)
 
     def kl(mean, log_variance):
@@ -212,7 +212,7 @@ def test_latents_that_follow_the_dynamics_cost_less_than_others():
         torch.as_tensor(actions),
         torch.zeros(40, dtype=torch.long),
     )
-    prior.condition(segments)
+    prior.conclude(segments)
     shuffled = segments._replace(actions=segments.actions.flip(0))
     assert float(prior.kl(segments)) < float(prior.kl(shuffled)) - 1.0
 
@@ -224,7 +224,7 @@ def test_latents_that_follow_the_dynamics_cost_less_than_others():
 def test_a_full_step_on_all_data_is_the_closed_form(factors, rows, window):
     closed, stepped = (dynamics(factors, rows, window, rate=1.0) for _ in range(2))
     segments = whole_episodes(1)
-    closed.condition(segments)
+    closed.conclude(segments)
     stepped.learn(whole_episodes(7), (3.0, 2.0))  # a full step forgets where it came from
     stepped.learn(segments, (1.0, 1.0))
     for left, right in zip(
@@ -233,11 +233,33 @@ def test_a_full_step_on_all_data_is_the_closed_form(factors, rows, window):
         torch.testing.assert_close(left, right, rtol=1e-12, atol=1e-12)
 
 
+@every_form
+def test_what_is_given_episodes_alone_forgets_all_others(factors, rows, window):
+    prior, closed = dynamics(factors, rows, window), dynamics(factors, rows, window)
+    prior.conclude(whole_episodes(7))
+    before = prior.state_dict()
+    closed.conclude(whole_episodes(1))
+    for left, right in zip(prior.given(whole_episodes(1)), closed.factor, strict=True):
+        torch.testing.assert_close(left, right, rtol=0, atol=0)
+    for left, right in zip(prior.factor, before["factor"], strict=True):
+        assert torch.equal(left, right)
+
+
+def test_without_the_closed_form_a_training_ends_with_one_more_step():
+    stepped, ended = (dynamics(closed_form=False, rate=0.3) for _ in range(2))
+    stepped.learn(whole_episodes(1), (1.0, 1.0))
+    ended.conclude(whole_episodes(1))
+    for left, right in zip(
+        (*stepped.factor, *stepped.initial), (*ended.factor, *ended.initial), strict=True
+    ):
+        assert torch.equal(left, right)
+
+
 def test_steps_of_a_small_rate_close_the_gap_geometrically():
     rate, steps = 0.3, 7
     stepped, closed = dynamics(rate=rate), dynamics()
     segments = whole_episodes(1)
-    closed.condition(segments)
+    closed.conclude(segments)
     for _ in range(steps):
         stepped.learn(segments, (1.0, 1.0))
     for now, target, start in zip(stepped.factor, closed.factor, stepped.prior, strict=True):
@@ -249,10 +271,10 @@ def test_weights_count_transitions_and_starts():
     stepped, many = dynamics(rate=1.0), dynamics()
     segments = whole_episodes(1)
     stepped.learn(segments, (3.0, 2.0))
-    many.condition(Segments(*(torch.cat([part] * 3) for part in segments)))
+    many.conclude(Segments(*(torch.cat([part] * 3) for part in segments)))
     for left, right in zip(stepped.factor, many.factor, strict=True):
         torch.testing.assert_close(left, right, rtol=1e-12, atol=1e-12)
-    many.condition(Segments(*(torch.cat([part] * 2) for part in segments)))
+    many.conclude(Segments(*(torch.cat([part] * 2) for part in segments)))
     for left, right in zip(stepped.initial, many.initial, strict=True):
         torch.testing.assert_close(left, right, rtol=1e-12, atol=1e-12)
 
@@ -262,7 +284,7 @@ def test_factors_are_bayesian_regressions(factors, rows, window):
     """Time-varying factors equal separate fits a time step; a shared one is fitted to all."""
     prior = dynamics(factors, rows, window)
     segments = whole_episodes(1)
-    prior.condition(segments)
+    prior.conclude(segments)
     data = transitions(segments, window, rows)
     entries, size = d if rows == "newest" else window * d, window * d + a + 1
     for t in range(T):
@@ -281,7 +303,7 @@ def test_factors_are_bayesian_regressions(factors, rows, window):
 def test_the_initial_factor_is_learned_from_starts_of_episodes():
     prior = dynamics()
     segments = made_up_segments(8, [0, 2, 0, 1], 4, d, a)
-    prior.condition(segments)
+    prior.conclude(segments)
     Psi, nu, mu, inverse_kappa = initial_belief(segments)
     found = prior.initial
     np.testing.assert_allclose(found.n, nu)
@@ -295,8 +317,8 @@ def test_the_initial_factor_is_learned_from_starts_of_episodes():
 def test_the_newest_rows_are_rows_of_the_whole(window):
     newest, whole = dynamics(rows="newest", window=window), dynamics(rows="all", window=window)
     segments = whole_episodes(1)
-    newest.condition(segments)
-    whole.condition(segments)
+    newest.conclude(segments)
+    whole.conclude(segments)
     data, every = (
         [now - before for now, before in zip(p.factor, p.prior, strict=True)]
         for p in (newest, whole)
@@ -330,7 +352,7 @@ def test_before_any_data_the_factors_are_the_prior():
     prior = dynamics()
     assert prior.metrics()["kl_dynamics"] == pytest.approx(0.0, abs=1e-9)
     assert prior.metrics()["kl_initial"] == pytest.approx(0.0, abs=1e-9)
-    prior.condition(whole_episodes(1))
+    prior.conclude(whole_episodes(1))
     assert prior.metrics()["kl_dynamics"] > 1.0
     assert prior.metrics()["kl_initial"] > 0.1
 
@@ -351,7 +373,8 @@ def test_the_standard_normal_knows_no_dynamics():
     prior, segments = StandardNormal(), whole_episodes(1)
     before = float(prior.kl(segments))
     prior.learn(segments, (1.0, 1.0))
-    prior.condition(segments)
+    prior.conclude(segments)
     assert prior.factor is None
+    assert prior.given(segments) is None
     assert float(prior.kl(segments)) == before
     assert prior.state_dict() == prior.metrics() == {}

@@ -32,9 +32,9 @@ def test_a_spark_runs_through_the_finite_values_in_its_box():
 
 def test_a_representation_that_its_method_calls_unhealthy_is_warned_of(tmp_path):
     with database(tmp_path) as store:
-        compute(store, cell(seed=0), [1.0, 0.5], train={"healthy": [1.0]})
-        compute(store, cell(seed=1), [1.0, 0.5], train={"healthy": [0.0]})
-        compute(store, cell("vae"), [1.0, 0.5], train={"healthy": [1.0]})
+        compute(store, cell(seed=0), [1.0, 0.5], train={"alive": [1.0]})
+        compute(store, cell(seed=1), [1.0, 0.5], train={"alive": [0.0]})
+        compute(store, cell("vae"), [1.0, 0.5], train={"alive": [1.0]})
         (problem,) = problems(store)
         shown = chart(store, problem.curves)
     assert shown.warnings == ["solar: the representation of at least one seed is not healthy"]

@@ -35,10 +35,35 @@ def toy(folder: Path, more: str = "") -> Path:
 @pytest.mark.parametrize("task", card_names())
 def test_every_card_resolves_for_each_of_its_methods_and_variants(task: str) -> None:
     card = load_card(task)
-    for variant in card.variants:
-        for name in set(card.tables["methods"]) & set(method_names()):
-            resolved = resolve(card, name, variant)
-            assert resolved.configuration.task.horizon >= 1
+    for name in set(card.tables["methods"]) & set(method_names()):
+        assert resolve(card, name).configuration.task.horizon >= 1
+        for variant, changes in card.tables["variants"].items():
+            if name in changes.get("methods", {}) or set(changes) - {"methods"}:
+                assert resolve(card, name, variant).configuration.task.horizon >= 1
+            else:
+                with pytest.raises(UsageError, match="changes nothing"):
+                    resolve(card, name, variant)
+
+
+def test_a_card_extends_another(tmp_path: Path) -> None:
+    base = load_card(str(toy(tmp_path)))
+    path = tmp_path / "other.toml"
+    path.write_text('extends = "toy"\nsummary = "Other."\n[task]\nhorizon = 7\n')
+    other = load_card(str(path))
+    assert (other.name, other.summary, other.task.horizon) == ("other", "Other.", 7)
+    assert other.task.action == base.task.action
+    for wrong in ('"none-such"', '"other"', "3"):
+        path.write_text(f"extends = {wrong}")
+        check(lambda: load_card(str(path)), [str(path), "extends"])
+
+
+def test_a_method_can_be_like_another_one(tmp_path: Path) -> None:
+    card = load_card("nav")
+    solar, vae = (resolve(card, name).configuration.method for name in ("solar", "vae"))
+    assert vae.representation == solar.representation
+    assert vae.local_fit.method == "gmm"  # its own default stands
+    path = toy(tmp_path, '[methods.vae]\nlike = "slar"')
+    check(lambda: load_card(str(path)), ["methods.vae.like", "solar"])
 
 
 def test_later_layers_win_and_each_value_knows_where_it_comes_from(tmp_path: Path) -> None:
