@@ -16,6 +16,7 @@ from solar_cli.settings.registry import method, settings_class
 from solar_cli.settings.schema import completed, hashed_values
 from solar_cli.settings.task import EvaluationSettings, TaskSettings
 
+LONGEST_NAME = 60  # of a variant: it names files of a report and columns of a table
 MOST_SEEDS = 10_000
 """of one run: beyond any experiment, and a slip of the pen must not fill the memory"""
 
@@ -96,6 +97,10 @@ def cells(
 ) -> list[Cell]:
     """The cells of one task and method, one a seed; a change of another method changes nothing."""
     configuration = resolve(card, method_name, variant, sets).configuration
+    if label in card.variants:
+        raise UsageError(
+            f"--label {label!r} is a variant of task {card.name!r} already: choose another label"
+        )
     own = [text for text in sets if _concerns(text, method_name)]
     name = variant_name(variant, own, label if own or not sets else None)
     return [Cell(card.name, method_name, name, seed, configuration) for seed in seeds]
@@ -104,10 +109,10 @@ def cells(
 def variant_name(variant: str, sets: Sequence[str], label: str | None) -> str:
     """The name of a variant made by ``--set``: its label, or what it changes."""
     if label is not None:
-        if not NAME.match(label) or label == "default":
+        if not NAME.match(label) or len(label) > LONGEST_NAME or label == "default":
             raise UsageError(
-                f"--label {label!r}: use lower-case letters, digits, '-', '_' and '.', "
-                "and not 'default'"
+                f"--label {label!r}: use at most {LONGEST_NAME} lower-case letters, digits, '-', "
+                "'_' and '.'"
             )
         return label
     if not sets:
@@ -118,7 +123,11 @@ def variant_name(variant: str, sets: Sequence[str], label: str | None) -> str:
         # The whole path but for where it starts: two settings of one name are two variants.
         key = re.sub(r"^\s*(task|methods\.[^.]+)\.", "", path)
         changes.append("-".join(_plain(part) for part in (key, value)))
-    return "_".join([variant] * (variant != "default") + changes)
+    name = "_".join([variant] * (variant != "default") + changes)
+    if len(name) <= LONGEST_NAME:
+        return name
+    digest = hashlib.sha256(name.encode()).hexdigest()[:8]
+    return f"{name[: LONGEST_NAME - 9]}_{digest}"
 
 
 def _plain(text: str) -> str:
@@ -149,7 +158,9 @@ def parse_seeds(text: str) -> list[int]:
     if len(seeds) > MOST_SEEDS:
         raise UsageError(f"--seeds {text!r}: expected at most {MOST_SEEDS} seeds")
     if not seeds or min(seeds) < 0 or len(set(seeds)) < len(seeds) or max(seeds) >= 2**31:
-        raise UsageError(f"--seeds {text!r}: expected at least one seed, each once, from 0 up")
+        raise UsageError(
+            f"--seeds {text!r}: expected at least one seed, each once, 0 to {2**31 - 1}"
+        )
     return seeds
 
 

@@ -172,8 +172,8 @@ def test_the_initial_state_is_that_of_the_episodes():
     model = infer(newest, basis, only_data()).model
     start = newest.z[:, 0].numpy()
     np.testing.assert_allclose(model.mu0, start.mean(axis=0), atol=1e-9)
-    # A weak prior counts as one sample without spread.
-    np.testing.assert_allclose(model.Sigma0, np.cov(start.T, bias=True) * 30 / 31, atol=1e-7)
+    np.testing.assert_allclose(model.Sigma0, np.cov(start.T, bias=True), atol=1e-8)
+    assert float(torch.linalg.eigvalsh(model.Sigma0).min()) > 0
 
 
 # Appendix B in NumPy
@@ -285,6 +285,36 @@ def test_pseudo_counts_are_of_the_factor_and_of_older_batches(window):
         )
         assert_increments(part, basis, now)
     assert (fit.metrics["prior_model"], fit.metrics["prior_older"]) == (9.0, 4.0)
+
+
+@pytest.mark.parametrize("factors", ["shared", "varying"])
+def test_the_models_own_factor_is_the_prior_as_it_stands(factors):
+    """Section 4.1 as printed: the prior of a time step is q(F, Sigma), with all its counts."""
+    newest, basis = states(*first_order(20, seed=5)[:2])
+    y, actions = first_order(30, seed=6)[:2]
+    one = np.ones((30, T, 1))
+    regressors = torch.as_tensor(np.concatenate([y[:, :-1], actions, one], axis=-1))
+    targets = torch.as_tensor(y[:, 1:])
+    if factors == "shared":
+        factor = mniw.regression_statistics(regressors.flatten(0, 1), targets.flatten(0, 1))
+    else:
+        factor = mniw.regression_statistics(regressors.transpose(0, 1), targets.transpose(0, 1))
+    x, increments = regression_inputs(states(y, actions, basis=basis)[0])
+    settings = only_data(prior_counts="own")
+    fit = infer(newest, basis, settings, factor=factor)
+    own_x, own_y = regression_inputs(newest)
+    for t in range(T):
+        if factors == "shared":
+            part = [p[0] for p in sums(x.reshape(1, 30 * T, -1), increments.reshape(1, 30 * T, -1))]
+        else:
+            part = [p[t] for p in sums(x, increments)]
+        part[3] -= 1.0  # the intercept's
+        expected = ridge_regression(own_x, own_y, own_x, settings, np.eye(T), [(1.0, part)])
+        found = fit.model._replace(
+            F=fit.model.F[t : t + 1], f=fit.model.f[t : t + 1], Sigma=fit.model.Sigma[t : t + 1]
+        )
+        assert_increments(found, basis, [p[t : t + 1] for p in expected])
+    assert fit.metrics["prior_model"] == 1.0
 
 
 def test_held_out_likelihood_is_that_of_refitting_without_the_fold():
@@ -419,6 +449,16 @@ def test_two_episodes_are_enough_to_infer_something():
     for method in ("posterior", "regression"):
         model = infer(newest, basis, LocalFit(method=method)).model
         assert all(bool(torch.isfinite(part).all()) for part in model)
+
+
+def test_a_mixture_prior_sees_older_batches():
+    newest, basis = states(*first_order(6, seed=5)[:2])
+    past = [states(*first_order(60, seed=n)[:2], basis=basis)[0] for n in (7, 11)]
+    alone, informed = (
+        infer(newest, basis, only_data(method="gmm"), older).metrics for older in ([], past)
+    )
+    assert informed["one_step_log_likelihood"] > alone["one_step_log_likelihood"] + 0.5
+    assert informed["one_step_r2"] > alone["one_step_r2"]
 
 
 def test_a_mixture_prior_is_drawn_from_its_streams():

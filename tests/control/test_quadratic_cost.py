@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from solar_cli.control.quadratic_cost import fit_quadratic_cost
+from solar_cli.control.quadratic_cost import explained, fit_quadratic_cost
 from solar_cli.control.trajectories import Trajectories
 from solar_cli.settings.local import CostFit
 
@@ -152,6 +152,12 @@ def test_r2_is_that_of_episodes_left_out():
     assert fit(noisy, per_time="never").r2 == pytest.approx(expected, abs=0.01)
 
 
+def test_r2_on_other_episodes_is_that_of_the_models_predictions():
+    model, others = fit(batch(quadratic)).model, batch(lambda z, t: z[:, 0] ** 3, seed=9)
+    assert explained(model, others) == pytest.approx(r2(model, others), rel=1e-12)
+    assert explained(model, batch(quadratic, seed=9)) > 0.999
+
+
 def varying(z, t):
     """The minimum moves, and the curvature with it."""
     return quadratic(z, C=(1 + t) * C / 3, c=c * (t - 2), b=b)
@@ -200,15 +206,6 @@ def test_a_few_episodes_are_enough_to_judge(episodes):
     assert fit(states, per_time="never").r2 > 0.99
 
 
-@pytest.mark.xfail(strict=True, reason="one episode leaves none to fit what is judged")
-def test_one_episode_is_judged_by_what_was_fitted():
-    """A representation may be judged on a single held-out episode."""
-    states = batch(quadratic, episodes=1, horizon=30)
-    found = fit(states, per_time="never")
-    assert r2(found.model, states) > 0.99
-    assert found.r2 > 0.9
-
-
 @pytest.mark.xfail(strict=True, reason="_r2 divides rounding by the least variance")
 def test_a_constant_cost_is_explained():
     states = batch(lambda z, t: np.full(len(z), 3.0))
@@ -216,22 +213,20 @@ def test_a_constant_cost_is_explained():
     assert fit(pure, alpha=0.0).r2 > 0.99
 
 
-@pytest.mark.xfail(strict=True, reason="of nine episodes one is the judge")
-@pytest.mark.parametrize("seed", [5, 11, 35])
+@pytest.mark.parametrize("seed", range(6))
 def test_a_good_representation_is_not_taken_for_a_dead_one(seed):
-    """As many episodes as are held out of sixty; latents miss the truth by a tenth of a std.
-
-    Over all episodes such latents explain 97 % of the costs, and half of it is what health asks.
-    """
+    """Latents of a moving point and a goal miss the truth by a tenth of a std: half of the costs'
+    variance is what health asks, and a fit on 51 episodes explains far more on the other 9."""
     rng = np.random.default_rng(seed)
-    place, goal = rng.uniform(-1, 1, (2, 9, 1, 2))
-    place = place + np.cumsum(0.1 * rng.normal(size=(9, 51, 2)), axis=1)
+    place, goal = rng.uniform(-1, 1, (2, 60, 1, 2))
+    place = place + np.cumsum(0.1 * rng.normal(size=(60, 51, 2)), axis=1)
     truth = np.concatenate([place, np.broadcast_to(goal, place.shape)], axis=-1)
     z = (truth - truth.mean(axis=(0, 1))) / truth.std(axis=(0, 1))
     z = z + 0.1 * rng.normal(size=z.shape)
     costs = np.square(place - goal).sum(axis=-1)[:, :-1]
-    actions = np.zeros((9, 50, 2))
-    states = Trajectories(*map(torch.as_tensor, (z, actions, actions, costs)))
-    found = fit(states, features=4, per_time="never")
-    assert r2(found.model, states) > 0.9
-    assert found.r2 > 0.5
+    actions = np.zeros((60, 50, 2))
+    learned, judge = (
+        Trajectories(*(torch.as_tensor(part[rows]) for part in (z, actions, actions, costs)))
+        for rows in (slice(51), slice(51, None))
+    )
+    assert explained(fit(learned, features=4, per_time="never").model, judge) > 0.8

@@ -7,9 +7,14 @@ import numpy as np
 import pytest
 import torch
 
-from solar_cli.control.linear_gaussian import LinearGaussianPolicy, initial_policy
+from solar_cli.control.linear_gaussian import (
+    LinearDynamics,
+    LinearGaussianPolicy,
+    QuadraticCost,
+    initial_policy,
+)
 from solar_cli.control.step_size import StepSize
-from solar_cli.control.trust_region import Anchor, TrustRegion
+from solar_cli.control.trust_region import Anchor, TrustRegion, promised_fall
 from solar_cli.episodes import Episodes
 
 GAINS = initial_policy(3, 2, 1, 0.5)
@@ -135,6 +140,48 @@ def test_metrics_say_what_happened():
         "rejected": 1.0,
         "step_multiplier": 0.4,
     }
+
+
+def test_nothing_is_said_of_an_improvement_that_nobody_promised():
+    assert after(10.0).metrics() == {"rejected": 0.0, "step_multiplier": 1.0}
+
+
+def test_a_promise_is_the_fall_of_what_is_collected():
+    """Expected costs of t < T by a loop over moments; the weight of the last state is no cost."""
+    rng = np.random.default_rng(0)
+    d, a, horizon = 2, 1, 4
+
+    def policy():
+        root = rng.normal(size=(horizon, a, a))
+        S = root @ root.swapaxes(1, 2) + 0.1
+        return rng.normal(size=(horizon, a, d)), rng.normal(size=(horizon, a)), S
+
+    F, f = 0.5 * rng.normal(size=(horizon, d, d + a)), rng.normal(size=(horizon, d))
+    Sigma, mu0, Sigma0 = np.tile(0.1 * np.eye(d), (horizon, 1, 1)), rng.normal(size=d), np.eye(d)
+    root = rng.normal(size=(horizon + 1, d + a, d + a))
+    C, c = root @ root.swapaxes(1, 2), rng.normal(size=(horizon + 1, d + a))
+    C[-1] *= 1e3
+    b = rng.normal(size=horizon + 1)
+
+    def collected(K, k, S):
+        total, mean, covariance = 0.0, mu0, Sigma0
+        for t in range(horizon):
+            lift = np.vstack([np.eye(d), K[t]])
+            x = lift @ mean + np.concatenate([np.zeros(d), k[t]])
+            spread = lift @ covariance @ lift.T
+            spread[d:, d:] += S[t]
+            total += 0.5 * (x @ C[t] @ x + np.trace(C[t] @ spread)) + c[t] @ x + b[t]
+            mean, covariance = F[t] @ x + f[t], F[t] @ spread @ F[t].T + Sigma[t]
+        return total
+
+    before, now = policy(), policy()
+    found = promised_fall(
+        LinearGaussianPolicy(*map(torch.as_tensor, before)),
+        LinearGaussianPolicy(*map(torch.as_tensor, now)),
+        LinearDynamics(*map(torch.as_tensor, (F, f, Sigma, mu0, Sigma0))),
+        QuadraticCost(*map(torch.as_tensor, (C, c, b))),
+    )
+    assert found == pytest.approx(collected(*before) - collected(*now), rel=1e-9)
 
 
 @pytest.mark.parametrize("costs", [(), (10.0,), (10.0, 11.0), (10.0, 20.0)])

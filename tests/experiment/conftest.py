@@ -14,8 +14,8 @@ HERE = Path(__file__).parent
 
 
 @pytest.fixture(scope="module", autouse=True)
-def fake_package(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """Installs the fake method; the value of PYTHONPATH with which workers find it too."""
+def fake_package(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Installs the fake method, for workers too."""
     torch.set_num_threads(1)  # as in a worker
     site = tmp_path_factory.mktemp("site")
     metadata = site / "fake_method-0.1.dist-info"
@@ -25,10 +25,9 @@ def fake_package(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(HERE))
         patch.syspath_prepend(str(site))
-        path = f"{site}:{HERE}"
-        patch.setenv("PYTHONPATH", path)
+        patch.setenv("PYTHONPATH", f"{site}:{HERE}", prepend=":")
         registry._known.cache_clear()
-        yield path
+        yield
     registry._known.cache_clear()
 
 

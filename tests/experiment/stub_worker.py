@@ -1,56 +1,79 @@
-"""A worker without learning, so that it starts fast: ``STUB`` says what each seed does."""
+"""A worker without learning that starts fast: ``STUB`` says what each seed does."""
 
+import json
 import os
 import signal
 import sys
 import time
+from typing import Any
 
-from solar_cli.experiment.messages import Message
-from solar_cli.experiment.worker import Pipe, _parser
-from solar_cli.store.records import Outcome
-from solar_cli.store.store import Store
+ARGUMENTS = dict(zip(sys.argv[1::2], sys.argv[2::2], strict=True))
+CELL, ATTEMPT, TARGET = (ARGUMENTS[f"--{name}"] for name in ("cell", "attempt", "target"))
+stopping = False
 
-options = _parser().parse_args()
-pipe = Pipe(options.pipe)
-print("argv", sys.argv, "threads", os.environ["OMP_NUM_THREADS"])
-with Store.open() as store:
-    cell = store.find(options.cell).cell
-    what, _, detail = os.environ["STUB"].split(",")[cell.seed].partition(":")
-    pipe.tell(Message(1, 0, None, "waking", 0.0))
 
-    def work(seconds: float) -> None:
-        end = time.monotonic() + seconds
-        while time.monotonic() < end and not pipe.stopping:
-            pipe.tell(Message(1, 0, None, "working", 0.5))
-            time.sleep(0.02)
+def stop(*_: object) -> None:
+    global stopping
+    stopping = True
 
-    match what:
-        case "finish":
-            work(float(detail or 0))
-            outcome = Outcome.INTERRUPTED if pipe.stopping else Outcome.FINISHED
-            if not pipe.stopping:
-                store.commit(
-                    options.cell,
-                    options.attempt,
-                    iteration=1,
-                    episodes=options.target,
-                    steps=0,
-                    simulated_seconds=0.0,
-                    seconds=1.0,
-                )
-                pipe.tell(Message(1, options.target, 0.5, "done", 1.0))
-            store.end(options.cell, options.attempt, outcome)
-        case "exit":
-            sys.exit(int(detail))
-        case "signal":
-            os.kill(os.getpid(), signal.Signals[detail])
-            time.sleep(60)
-        case "deaf":
-            signal.signal(signal.SIGTERM, signal.SIG_IGN)
-            time.sleep(60)
-        case "taken":
-            store.end(options.cell, options.attempt, Outcome.INTERRUPTED)
-            from solar_cli.store.owner import Owner
 
-            store.claim(options.cell, Owner.of(os.getppid()), options.target, {})
-            work(60)
+def say(activity: str, fraction: float, episodes: int = 0, headline: float | None = None) -> None:
+    message = {"iteration": 1, "episodes": episodes, "headline": headline}
+    line = json.dumps(message | {"activity": activity, "fraction": fraction}) + "\n"
+    os.write(int(ARGUMENTS["--pipe"]), line.encode())
+
+
+def work(seconds: float) -> None:
+    end = time.monotonic() + seconds
+    while time.monotonic() < end and not stopping:
+        say("working", 0.5)
+        time.sleep(0.02)
+
+
+def store() -> Any:
+    from solar_cli.store.store import Store  # the slow part: most stubs do without
+
+    return Store.open()
+
+
+def finish(seconds: float) -> None:
+    work(seconds)
+    from solar_cli.store.records import Outcome
+
+    totals = {"steps": 0, "simulated_seconds": 0.0, "seconds": 1.0}
+    with store() as opened:
+        if not stopping:
+            opened.commit(CELL, int(ATTEMPT), iteration=1, episodes=int(TARGET), **totals)
+            say("done", 1.0, int(TARGET), 0.5)
+        outcome = Outcome.INTERRUPTED if stopping else Outcome.FINISHED
+        opened.end(CELL, int(ATTEMPT), outcome)
+
+
+def lose_the_cell() -> None:
+    """Another run takes the cell over."""
+    from solar_cli.store.owner import Owner
+    from solar_cli.store.records import Outcome
+
+    with store() as opened:
+        opened.end(CELL, int(ATTEMPT), Outcome.INTERRUPTED)
+        opened.claim(CELL, Owner.of(os.getppid()), int(TARGET), {})
+    work(60)
+
+
+signal.signal(signal.SIGTERM, stop)
+say("waking", 0.0)
+print("argv", sys.argv, "threads", os.environ["OMP_NUM_THREADS"], flush=True)
+what, _, detail = json.loads(os.environ["STUB"])[CELL].partition(":")
+match what:
+    case "finish":
+        finish(float(detail or 0))
+    case "exit":
+        sys.exit(int(detail))
+    case "signal":
+        os.kill(os.getpid(), signal.Signals[detail])
+        time.sleep(60)
+    case "deaf":
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        time.sleep(60)
+    case "lose":
+        lose_the_cell()

@@ -1,5 +1,6 @@
 """The scheduler: every cell ends with an outcome, whatever its worker does."""
 
+import json
 import os
 import signal
 import subprocess
@@ -32,11 +33,17 @@ def stub(
     def run_stubs(
         *words: str, report: Callable[[Event], None] = lambda _: None, workers: int = 2
     ) -> list[Result]:
-        monkeypatch.setenv("STUB", ",".join(words))
-        plans = plan(store, make_cells(len(words)))
+        cells = make_cells(len(words))
+        tell_stubs(monkeypatch, cells, *words)
+        plans = plan(store, cells)
         return run(plans, store, engine=STUB, workers=workers, report=report)
 
     return run_stubs
+
+
+def tell_stubs(monkeypatch: pytest.MonkeyPatch, cells: list[Cell], *words: str) -> None:
+    told = {cell.hash: word for cell, word in zip(cells, words, strict=True)}
+    monkeypatch.setenv("STUB", json.dumps(told))
 
 
 def test_a_worker_that_dies_touches_no_other_cell(
@@ -154,7 +161,7 @@ def test_a_cell_that_was_taken_over_is_left_to_its_new_owner(
 ) -> None:
     monkeypatch.setattr(supervision, "BEAT_SECONDS", 0.0)
     started = time.monotonic()
-    [result] = stub("taken")
+    [result] = stub("lose")
     assert time.monotonic() - started < 40  # its worker, which would go on for a minute, is killed
     assert result.outcome is None
     assert not result.finished
@@ -182,7 +189,7 @@ def test_a_cell_that_another_run_computes_is_left_to_it(
             )
             store.end(theirs.hash, number, Outcome.FINISHED)
 
-    monkeypatch.setenv("STUB", "finish,exit:9")
+    tell_stubs(monkeypatch, [mine, theirs], "finish", "exit:9")
     results = run(plans, store, engine=STUB, workers=1, report=finish_theirs)
     assert results[0].outcome is Outcome.FINISHED
     assert results[1].outcome is None  # not by this run ...

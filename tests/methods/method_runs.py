@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from solar_cli.envs import build_task
-from solar_cli.episodes import Environment
+from solar_cli.episodes import Environment, Experience
 from solar_cli.settings import cells, load, load_card, method
 from solar_cli.streams import Streams
 
@@ -51,7 +51,7 @@ class Run:
         """Iterations ``first`` to ``last``; wall-clock is left out of what they return."""
         for iteration in range(first, last + 1):
             self.environment.begin(iteration)
-            metrics = self.learner.iterate(self.environment)
+            metrics = self.learner.iterate(Experience(self.environment))
             self.metrics.append({k: v for k, v in metrics.items() if not k.startswith("seconds_")})
         return self
 
@@ -85,7 +85,7 @@ def digest(value: Any) -> str:
             found.update(part.detach().contiguous().numpy().tobytes())
         elif isinstance(part, dict):
             for key in sorted(part, key=repr):
-                if not str(key).startswith("seconds_"):
+                if "seconds" not in str(key):
                     found.update(repr(key).encode())
                     feed(part[key])
         elif isinstance(part, list | tuple):

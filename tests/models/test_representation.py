@@ -9,6 +9,7 @@ import torch
 from model_problems import digest, through_a_file, vector_episodes, vector_task
 
 from solar_cli.episodes import Episodes, window_indices
+from solar_cli.errors import UsageError
 from solar_cli.models import representation, training
 from solar_cli.models.priors import LinearDynamics
 from solar_cli.models.representation import Representation
@@ -24,7 +25,7 @@ class Stop(Exception):
 
 
 class Collected:
-    """An environment's side of it: the iteration, and batches of the last ones."""
+    """A learner's experience: the iteration, and one batch for each up to it."""
 
     def __init__(self, *batches: Episodes) -> None:
         self.batches = batches
@@ -35,22 +36,25 @@ class Collected:
 
 
 class Scores:
-    """Stands for the cost fit: gives what it is told, and keeps the states it is asked about."""
+    """Stands for the cost fit: gives what it is told, and keeps what it is asked about."""
 
     def __init__(self, *scores: float) -> None:
         self.scores = scores
-        self.seen: list[tuple[torch.Tensor, Episodes]] = []
+        self.states: list[torch.Tensor] = []
+        self.episodes: list[tuple[Episodes, Episodes]] = []
 
-    def __call__(self, z: torch.Tensor, episodes: Episodes) -> float:
-        self.seen.append((z, episodes))
-        return self.scores[min(len(self.seen), len(self.scores)) - 1]
+    def __call__(self, model: Representation, learned: Episodes, held_out: Episodes) -> float:
+        self.states.append(model.embed(FIRST))
+        self.episodes.append((learned, held_out))
+        return self.scores[min(len(self.states), len(self.scores)) - 1]
 
 
 @pytest.fixture(autouse=True)
 def short_and_easily_pleased(monkeypatch):
-    """A pulse every second step; only the cost score tells a healthy representation."""
+    """A pulse every second step; only the cost score tells what is alive."""
     monkeypatch.setattr(training, "PULSE_STEPS", 2)
     monkeypatch.setattr(representation, "LEAST_EXPLAINED", -math.inf)
+    monkeypatch.setattr(representation, "ACTIVE_SHARE", 0.0)
 
 
 def make(score=None, pulse=lambda *_: None, seed=0, task=TASK, **changes) -> Representation:
@@ -74,8 +78,14 @@ def make(score=None, pulse=lambda *_: None, seed=0, task=TASK, **changes) -> Rep
     )
 
 
-def held_out(share=0.15) -> Episodes:
-    return FIRST[-max(1, round(share * len(FIRST))) :]
+def losses_by_attempt(seen: list[float], model_of):
+    """A pulse that keeps the ELBO of every finished attempt."""
+
+    def pulse(*_):
+        candidates = model_of().state_dict()["candidates"]
+        seen[:] = [metrics["held_out_elbo"] for _, metrics, _ in candidates]
+
+    return pulse
 
 
 # Watching and repairing
@@ -85,92 +95,85 @@ def test_a_dead_representation_is_discarded_and_the_next_one_kept():
     score = Scores(0.1, 0.9)
     model = make(score)
     metrics = model.update(Collected(FIRST))
-    assert len(score.seen) == 2
-    first, second = (z for z, _ in score.seen)
-    kept = model.embed(score.seen[1][1])
-    assert torch.equal(kept, second)
-    assert not torch.allclose(kept, first)
+    first, second = score.states
+    assert torch.equal(model.embed(FIRST), second)
+    assert not torch.allclose(second, first)
     assert metrics["discarded_trainings"] == 1.0
     assert metrics["seconds_discarded"] > 0.0
-    assert metrics["latent_cost_r2"] == 0.9
-    assert metrics["healthy"] == 1.0
+    assert metrics["held_out_cost_r2"] == 0.9
+    assert metrics["alive"] == 1.0
 
 
-def test_a_healthy_representation_is_the_last_that_is_trained():
+def test_a_living_representation_is_the_last_that_is_trained():
     score = Scores(0.9)
     metrics = make(score).update(Collected(FIRST))
-    assert len(score.seen) == 1
+    assert len(score.states) == 1
     assert metrics["discarded_trainings"] == metrics["seconds_discarded"] == 0.0
 
 
-def test_unexplained_frames_are_dead_too(monkeypatch):
-    monkeypatch.setattr(representation, "LEAST_EXPLAINED", 1.0)
+@pytest.mark.parametrize(("threshold", "least"), [("LEAST_EXPLAINED", 1.0), ("ACTIVE_SHARE", 1.1)])
+def test_unexplained_frames_and_sleeping_latents_are_dead_too(monkeypatch, threshold, least):
+    monkeypatch.setattr(representation, threshold, least)
     score = Scores(1.0)
-    metrics = make(score).update(Collected(FIRST))
-    assert len(score.seen) == 3
-    assert metrics["explained_variance"] < 1.0
-    assert metrics["healthy"] == 0.0
+    with pytest.warns(UserWarning, match="no representation of 3 is alive"):
+        metrics = make(score).update(Collected(FIRST))
+    assert len(score.states) == 3
+    assert metrics["alive"] == 0.0
+    assert metrics["least_explained_variance"] < 1.0
 
 
-def test_of_dead_representations_the_one_of_least_held_out_loss_is_kept():
-    seen: dict[int, float] = {}
-
-    def pulse(*_):
-        for number, candidate in enumerate(model.state_dict()["candidates"]):
-            seen[number] = candidate[0]
-
+def test_of_dead_representations_the_one_of_best_held_out_elbo_is_kept():
+    seen: list[float] = []
     score = Scores(0.0)
-    model = make(score, pulse)
-    metrics = model.update(Collected(FIRST))
-    assert len(score.seen) == 3
-    assert metrics["discarded_trainings"] == 2.0
-    assert metrics["healthy"] == 0.0
-    assert metrics["held_out_loss"] <= min(seen.values())
-    losses = [seen[0], seen[1], metrics["held_out_loss"]]
-    best = int(np.argmin(losses))
-    assert torch.equal(model.embed(score.seen[best][1]), score.seen[best][0])
-
-
-def test_a_healthy_one_is_kept_whatever_its_loss():
-    seen: dict[int, float] = {}
-
-    def pulse(*_):
-        for number, candidate in enumerate(model.state_dict()["candidates"]):
-            seen[number] = candidate[0]
-
-    # The second attempt is the healthy one, trained so briefly that seeds decide about losses.
-    for seed in range(20):
-        score = Scores(0.0, 1.0)
-        model = make(score, pulse, seed=seed)
+    model = make(score, losses_by_attempt(seen, lambda: model))
+    with pytest.warns(UserWarning, match="alive"):
         metrics = model.update(Collected(FIRST))
-        if metrics["held_out_loss"] > seen[0]:
+    assert len(score.states) == 3
+    assert metrics["discarded_trainings"] == 2.0
+    assert len(seen) == 2
+    assert metrics["held_out_elbo"] >= max(seen)
+    best = int(np.argmax([*seen, -math.inf]))
+    if metrics["held_out_elbo"] > max(seen):
+        best = 2
+    assert torch.equal(model.embed(FIRST), score.states[best])
+
+
+def test_a_living_one_is_kept_whatever_its_elbo():
+    # The second attempt is alive; both are trained so briefly that seeds decide about ELBOs.
+    for seed in range(20):
+        seen: list[float] = []
+        score = Scores(0.0, 1.0)
+        model = make(score, losses_by_attempt(seen, lambda: model), seed=seed)  # noqa: B023
+        metrics = model.update(Collected(FIRST))
+        if metrics["held_out_elbo"] < seen[0]:
             break
     else:
         pytest.fail("no seed's second training is worse than its first")
-    assert torch.equal(model.embed(score.seen[1][1]), score.seen[1][0])
+    assert torch.equal(model.embed(FIRST), score.states[1])
 
 
-def test_attempts_are_judged_on_episodes_that_they_did_not_learn_from():
-    score, standardised = Scores(0.0), []
-    model = make(score, held_out=0.3, attempts=2)
-    original = representation.FrameModel.standardise_by
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            representation.FrameModel,
-            "standardise_by",
-            lambda self, frames: standardised.append(frames) or original(self, frames),
-        )
-        model.update(Collected(FIRST))
+@pytest.mark.filterwarnings("ignore:no representation")
+def test_attempts_are_judged_on_episodes_that_they_did_not_learn_from(monkeypatch):
+    standardised, original = [], representation.FrameModel.standardise_by
+    monkeypatch.setattr(
+        representation.FrameModel,
+        "standardise_by",
+        lambda self, frames: standardised.append(frames.numpy()) or original(self, frames),
+    )
+    score = Scores(0.0)
+    make(score, held_out=0.3, attempts=2).update(Collected(FIRST))
     kept = round(0.3 * 14)
-    for _, episodes in score.seen:
-        np.testing.assert_array_equal(episodes.frames, FIRST.frames[-kept:])
+    for learned, held_out in score.episodes:
+        np.testing.assert_array_equal(learned.frames, FIRST.frames[:-kept])
+        np.testing.assert_array_equal(held_out.frames, FIRST.frames[-kept:])
     for frames in standardised:
-        np.testing.assert_array_equal(frames.numpy(), FIRST.frames[:-kept].reshape(-1, 3))
+        np.testing.assert_array_equal(frames, FIRST.frames[:-kept].reshape(-1, 3))
 
 
 def test_an_active_latent_is_one_whose_mean_carries_its_variance(monkeypatch):
     model = make()
     model.update(Collected(FIRST))
+    monkeypatch.setattr(representation, "ACTIVE_SHARE", 0.9)
     segments = model._model.posterior(FIRST, "cpu")
     # One latent varies as its variance is, so its mean carries half; the other hardly has any.
     spread = segments.mean.flatten(0, 1).var(dim=0)
@@ -181,6 +184,13 @@ def test_an_active_latent_is_one_whose_mean_carries_its_variance(monkeypatch):
         lambda *_: segments._replace(variance=variance.expand_as(segments.variance)),
     )
     assert model._judge(FIRST)["active_latents"] == 1.0
+
+
+def test_segments_must_be_longer_than_windows():
+    with pytest.raises(UsageError, match=r"training\.length = 2.*window of 2"):
+        make(length=2)
+    with pytest.raises(UsageError, match=r"horizon = 1.*window of 2"):
+        make(task=vector_task(horizon=1, window=2))
 
 
 # Weights and seeds
@@ -194,10 +204,10 @@ def test_first_weights_depend_on_seed_and_attempt_alone():
     torch.manual_seed(456)
     assert digest(make().state_dict()) == first
     assert digest(make(seed=1).state_dict()) != first
-    trained = make(Scores(0.0, 1.0))
-    trained.update(Collected(FIRST))
-    again = make(Scores(0.0, 1.0))
-    again.update(Collected(FIRST))
+    # The second attempt is what it is, whatever the first one was.
+    trained, again = (make(Scores(0.0, 1.0), attempts=attempts) for attempts in (2, 3))
+    for model in (trained, again):
+        model.update(Collected(FIRST))
     assert torch.equal(trained.embed(FIRST), again.embed(FIRST))
 
 
@@ -209,14 +219,26 @@ def checkpoints(batches: list[Collected], **changes) -> tuple[list[Any], str, li
     saved: list[Any] = []
 
     def pulse(*_):
-        saved.append((len(metrics), through_a_file(model.state_dict()), len(score.seen)))
+        saved.append((len(metrics), through_a_file(model.state_dict()), len(score.states)))
 
-    score = Scores(0.1, 0.2, 0.9, 0.9, 0.9)
+    score = Scores(*SCORES)
     model = make(score, pulse, **changes)
     metrics: list[dict[str, float]] = []
     for batch in batches:
         metrics.append(model.update(batch))
-    return saved, digest(model.state_dict()), metrics
+    return saved, timeless(model.state_dict()), metrics
+
+
+SCORES = (0.1, 0.2, 0.9)
+
+
+def timeless(state: Any) -> str:
+    """The digest of a state without the seconds that were spent on it."""
+    if isinstance(state, dict):
+        return digest(
+            {name: timeless(part) for name, part in state.items() if "seconds" not in str(name)}
+        )
+    return digest([timeless(part) for part in state] if isinstance(state, list | tuple) else state)
 
 
 def without_seconds(metrics: dict[str, float]) -> dict[str, float]:
@@ -224,24 +246,34 @@ def without_seconds(metrics: dict[str, float]) -> dict[str, float]:
 
 
 @pytest.mark.parametrize("fine_tune_steps", [0, 4])
-def test_an_update_stopped_at_any_pulse_goes_on_with_the_same_bits(fine_tune_steps):
+@pytest.mark.parametrize("kills", [False, True])
+def test_an_update_stopped_at_any_pulse_goes_on_with_the_same_bits(
+    monkeypatch, fine_tune_steps, kills
+):
+    if kills:  # fine-tuning is taken back, as what was alive is not any more
+        monkeypatch.setattr(Representation, "_alive", staticmethod(lambda metrics: next(alive)))
+        alive = iter([True] * 3 + [True, False] * 99)
     second = vector_episodes(TASK, 6, seed=7)
     batches = [Collected(FIRST), Collected(FIRST, second)]
     changes = {"fine_tune_steps": fine_tune_steps, "attempts": 3}
     saved, expected, metrics = checkpoints(batches, **changes)
     assert len(saved) == 6 + fine_tune_steps // 2  # three attempts, two of them dead
+    assert metrics[0]["discarded_trainings"] == 2.0
+    if fine_tune_steps:
+        assert metrics[1]["fine_tuning_taken_back"] == float(kills)
     for number, state, judged in saved:
-        score = Scores(*[0.1, 0.2, 0.9, 0.9, 0.9][judged:])
-        resumed = make(score, **changes)
+        alive = iter([True] * (3 - judged) + [True, False] * 99)
+        resumed = make(Scores(*[*SCORES, 0.9][judged:]), **changes)
         resumed.load_state_dict(state)
         for batch, before in list(zip(batches, metrics, strict=True))[number:]:
             assert without_seconds(resumed.update(batch)) == without_seconds(before)
-        assert digest(resumed.state_dict()) == expected
+        assert timeless(resumed.state_dict()) == expected
 
 
-def test_a_checkpoint_can_be_made_again_before_anything_goes_on():
-    saved, _, _ = checkpoints([Collected(FIRST)])
-    for _, state, _ in saved:
+@pytest.mark.parametrize("fine_tune_steps", [0, 4])
+def test_a_checkpoint_can_be_made_again_before_anything_goes_on(fine_tune_steps):
+    batches = [Collected(FIRST), Collected(FIRST, vector_episodes(TASK, 6, seed=7))]
+    for _, state, _ in checkpoints(batches, fine_tune_steps=fine_tune_steps)[0]:
         fresh = make()
         fresh.load_state_dict(state)
         assert digest(through_a_file(fresh.state_dict())) == digest(state)
@@ -250,22 +282,43 @@ def test_a_checkpoint_can_be_made_again_before_anything_goes_on():
 # Later iterations
 
 
+def conditioned(model: Representation, *batches: Episodes) -> list[torch.Tensor]:
+    """The factor of a fresh prior after the closed form on these batches."""
+    closed = LinearDynamics(model.settings.dynamics, 2, TASK, "cpu")
+    closed.conclude(model._model.posterior(Episodes.joined(list(batches)), "cpu"))
+    return list(closed.factor)
+
+
+def own_factor(model: Representation) -> list[torch.Tensor]:
+    return list(model.dynamics_prior([], as_it_stands=True).factor)
+
+
 def test_a_frozen_encoder_keeps_its_states_and_learns_its_dynamics():
     model = make(buffer=2)
     batches = [FIRST, *(vector_episodes(TASK, 5, seed=seed) for seed in (1, 2))]
     model.update(Collected(batches[0]))
     assert model.moved
-    states, basis = model.embed(FIRST), model.basis
-    factor = model.dynamics_prior.factor
+    states, basis, factor = model.embed(FIRST), model.basis, own_factor(model)
     for last in (2, 3):
         model.update(Collected(*batches[:last]))
         assert not model.moved
     assert torch.equal(model.embed(FIRST), states)
     assert digest(list(model.basis)) == digest(list(basis))
-    closed = LinearDynamics(model.settings.dynamics, 2, TASK, "cpu")
-    closed.condition(model._model.posterior(Episodes.joined(batches[1:]), "cpu"))
-    assert digest(list(model.dynamics_prior.factor)) == digest(list(closed.factor))
-    assert digest(list(model.dynamics_prior.factor)) != digest(list(factor))
+    assert digest(own_factor(model)) == digest(conditioned(model, *batches[1:]))
+    assert digest(own_factor(model)) != digest(factor)
+
+
+def test_line_7_is_told_of_dynamics_by_older_episodes_alone():
+    """What judges how much to trust the factor has not been part of it."""
+    model = make()
+    older = [vector_episodes(TASK, 5, seed=seed) for seed in (1, 2)]
+    model.update(Collected(FIRST))
+    model.update(Collected(FIRST, *older))
+    prior = model.dynamics_prior(older, as_it_stands=False)
+    assert digest(list(prior.factor)) == digest(conditioned(model, *older))
+    assert model.dynamics_prior([], as_it_stands=False).factor is None
+    assert digest(list(prior.basis)) == digest(list(model.basis))
+    assert prior.latent == 2
 
 
 def test_fine_tuning_moves_the_states_within_a_fixed_basis():
@@ -274,17 +327,52 @@ def test_fine_tuning_moves_the_states_within_a_fixed_basis():
     states, basis = model.embed(FIRST), model.basis
     metrics = model.update(Collected(FIRST, vector_episodes(TASK, 6, seed=7)))
     assert model.moved
+    assert metrics["fine_tuning_taken_back"] == 0.0
     assert not torch.allclose(model.embed(FIRST), states)
     assert digest(list(model.basis)) == digest(list(basis))
-    assert {"elbo_reconstruction", "elbo_kl", "held_out_loss"} <= set(metrics)
+    assert {"elbo_reconstruction", "elbo_kl", "held_out_elbo"} <= set(metrics)
+
+
+def test_fine_tuning_is_judged_on_what_it_has_not_seen():
+    """The metrics of a batch are those of the model before it was trained on the batch."""
+    tuned, frozen = make(fine_tune_steps=4), make()
+    second = vector_episodes(TASK, 6, seed=7)
+    found = [
+        [model.update(batch) for batch in (Collected(FIRST), Collected(FIRST, second))][1]
+        for model in (tuned, frozen)
+    ]
+    for name in ("held_out_elbo", "held_out_kl", "least_explained_variance", "active_latents"):
+        assert found[0][name] == found[1][name]
+
+
+def test_fine_tuning_that_kills_is_taken_back(monkeypatch):
+    model = make(fine_tune_steps=4)
+    model.update(Collected(FIRST))
+    before = digest(model.state_dict()["parameters"]["networks"])
+    answers = iter([True, False])
+    monkeypatch.setattr(Representation, "_alive", staticmethod(lambda _: next(answers)))
+    metrics = model.update(Collected(FIRST, vector_episodes(TASK, 6, seed=7)))
+    assert metrics["fine_tuning_taken_back"] == 1.0
+    assert not model.moved
+    assert digest(model.state_dict()["parameters"]["networks"]) == before
+
+
+def test_what_was_dead_before_fine_tuning_is_tuned_all_the_same(monkeypatch):
+    model = make(fine_tune_steps=4)
+    model.update(Collected(FIRST))
+    monkeypatch.setattr(Representation, "_alive", staticmethod(lambda _: False))
+    metrics = model.update(Collected(FIRST, vector_episodes(TASK, 6, seed=7)))
+    assert metrics["fine_tuning_taken_back"] == 0.0
+    assert model.moved
 
 
 def test_metrics_of_an_update_are_finite_numbers():
+    model = make()
     for iteration in (1, 2):
-        metrics = make().update(Collected(*[FIRST] * iteration))
+        metrics = model.update(Collected(*[FIRST] * iteration))
         assert all(isinstance(value, float) for value in metrics.values())
         assert all(math.isfinite(value) for value in metrics.values())
-        assert {"kl_dynamics", "kl_initial", "seconds_model"} <= set(metrics)
+        assert {"kl_dynamics", "kl_initial", "held_out_elbo"} <= set(metrics)
 
 
 # States

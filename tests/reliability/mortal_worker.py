@@ -13,7 +13,6 @@ from solar_cli.envs.task import RowTask
 from solar_cli.episodes import Environment
 from solar_cli.experiment import checkpointing, session, worker
 from solar_cli.experiment.judge import Judge
-from solar_cli.methods.local import LocalLearner
 from solar_cli.store.store import Store
 
 moment, nth, who = os.environ["DIE"].split(":")
@@ -70,7 +69,7 @@ def inside_evaluation() -> None:
 MOMENTS: dict[str, Callable[[], None]] = {
     "collected": lambda: after(Environment, "collect"),
     "training": lambda: after(session.Session, "_pulse"),
-    "updated": lambda: after(LocalLearner, "adopted"),  # a new policy, the iteration not done
+    "updated": lambda: after(Environment, "summary"),  # a new policy, not yet evaluated
     "evaluating": inside_evaluation,
     "renamed": lambda: after(checkpointing, "save"),  # the file is there, its row is not
     "committed": lambda: after(Store, "commit"),

@@ -117,3 +117,20 @@ def test_a_variants_name_can_be_named_in_compare() -> None:
     name = variant_name("default", ['task.parameters."odd key:"="a:b C"'], None)
     assert not set(name) & set(": /\\\"'\n")
     assert name == name.lower()
+
+
+def test_a_label_is_not_a_variant_of_the_card() -> None:
+    card = load_card("nav")
+    for label in ("default", "paper"):
+        with pytest.raises(UsageError, match="choose another label"):
+            cells(card, "solar", [0], "smoke", ["task.horizon=9"], label)
+
+
+def test_long_names_are_cut_and_stay_apart() -> None:
+    card = load_card("nav")
+    long = [f"methods.solar.local_fit.widths={[1.0] * 30 + [last]}" for last in (2.0, 3.0)]
+    names = [cells(card, "solar", [0], sets=[text])[0].variant for text in long]
+    assert len(set(names)) == 2
+    assert max(map(len, names)) == 60
+    with pytest.raises(UsageError, match="at most 60"):
+        cells(card, "solar", [0], sets=["task.horizon=9"], label="a" * 61)
