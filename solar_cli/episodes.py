@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solar_cli.envs.task import Task
+from solar_cli.errors import SolarError
 from solar_cli.settings import TaskSettings
 from solar_cli.streams import Streams
 
@@ -201,7 +202,8 @@ class Environment:
         key = (self.iteration, self._call)
         self._call += 1
         entry = next((e for e in self._ledger if (e["iteration"], e["call"]) == key), None)
-        if entry is None or (found := self._load(entry)) is None:
+        found = None if entry is None else self._load(entry)
+        if found is None:
             streams = self._streams.under(*key)
             collected = roll_out(
                 self._task,
@@ -211,8 +213,12 @@ class Environment:
                 streams.generator("noise") if noisy else None,
             )
             found = collected.episodes
+            stored = self._store(key, noisy, collected)
             if entry is None:
-                self._ledger.append(self._store(key, noisy, collected))
+                self._ledger.append(stored)
+            elif stored["sha256"] != entry["sha256"]:
+                # The policy is not the one that collected them: a training has gone on since.
+                raise self._lost(entry)
         self._kept[key] = found
         return found
 
@@ -223,16 +229,17 @@ class Environment:
     def recent(self, batches: int) -> list[Episodes]:
         """The episodes of each of the last ``batches`` iterations, this one last."""
         first = max(1, self.iteration - batches + 1)
-        return [self.collected(iteration) for iteration in range(first, self.iteration + 1)]
+        held = {entry["iteration"] for entry in self._ledger}
+        return [self.collected(i) for i in range(first, self.iteration + 1) if i in held]
 
     def summary(self, iteration: int) -> dict[str, float]:
         """Means over the noisy episodes of an iteration: return, final measures, clipped share."""
         entries = [e for e in self._ledger if e["iteration"] == iteration and e["noisy"]]
         weights = [entry["episodes"] for entry in entries]
-        names = entries[0]["summary"] if entries else {}
+        names = set.intersection(*(set(e["summary"]) for e in entries)) if entries else set()
         return {
             name: float(np.average([e["summary"][name] for e in entries], weights=weights))
-            for name in names
+            for name in sorted(names)
         }
 
     def state_dict(self) -> dict[str, Any]:
@@ -249,12 +256,15 @@ class Environment:
         if key not in self._kept:
             found = self._load(entry)
             if found is None:
-                raise FileNotFoundError(
-                    f"episodes {self._folder / entry['file']} are missing or damaged: restore the "
-                    "file, or start the cell anew with --redo"
-                )
+                raise self._lost(entry)
             self._kept[key] = found
         return self._kept[key]
+
+    def _lost(self, entry: Mapping[str, Any]) -> SolarError:
+        return SolarError(
+            f"episodes {self._folder / entry['file']} are missing or damaged: restore the file, or "
+            "start the cell anew with --redo"
+        )
 
     def _load(self, entry: Mapping[str, Any]) -> Episodes | None:
         try:

@@ -305,11 +305,6 @@ DAMAGE: dict[str, Callable[[Path], object]] = {
 damaged = pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE)
 
 
-def defect(reason: str) -> pytest.MarkDecorator:
-    """A law that does not hold yet; the mark fails as soon as it does."""
-    return pytest.mark.xfail(strict=True, reason=reason)
-
-
 @damaged
 def test_a_damaged_file_of_this_iteration_is_collected_again(environment: Environment, damage):
     environment.begin(1)
@@ -325,7 +320,6 @@ def test_a_damaged_file_of_this_iteration_is_collected_again(environment: Enviro
     assert fresh.state_dict() == environment.state_dict()
 
 
-@defect("Environment.collect does not write what it collects again")
 @damaged
 def test_what_was_collected_again_is_there_for_later_processes(environment: Environment, damage):
     environment.begin(1)
@@ -336,7 +330,6 @@ def test_what_was_collected_again_is_there_for_later_processes(environment: Envi
     assert_equal_bits(again(fresh, 2).recent(2)[0], collected)
 
 
-@defect("Environment.collect does not compare what it collects again with the ledger's hash")
 def test_collecting_again_with_another_policy_is_refused(environment: Environment):
     environment.begin(1)
     environment.collect(Pull(), 4)
@@ -414,7 +407,6 @@ def test_a_failing_judge_is_out_of_a_learners_reach(
         assert {name: kept[name] for name in learned} == {name: all_of_it[name] for name in learned}
 
 
-@defect("Environment.summary takes the names of the first collection")
 def test_measures_of_some_episodes_only_are_no_mean(settings: TaskSettings, tmp_path: Path):
     task = Failing("measures", T + 1)
     environment = Environment(task, settings, Streams(1), tmp_path)

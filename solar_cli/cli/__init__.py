@@ -46,8 +46,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal may lack a letter of a table
     try:
-        code = app(arguments, prog_name="solar", standalone_mode=False)
+        code = _obey(arguments)
         sys.stdout.flush()
+    except BrokenPipeError:
+        silence_output()
+        return 1
+    except OSError as error:  # of files, the store has made a SolarError
+        silence_output()
+        place = error.filename or "standard output"
+        complain(f"solar: {place}: {error.strerror or error}; make room, or write elsewhere")
+        return 1
+    return code
+
+
+def _obey(arguments: Sequence[str] | None) -> int:
+    """Run one command, show its error, and return its exit code."""
+    try:
+        code = app(arguments, prog_name="solar", standalone_mode=False)
     except SolarError as error:
         complain(f"solar: {error}")
         return error.exit_code
@@ -60,9 +75,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except KeyboardInterrupt:
         return INTERRUPTED
-    except BrokenPipeError:
-        silence_output()
-        return 1
     return code if isinstance(code, int) else 0
 
 

@@ -10,6 +10,7 @@ from solar_cli.cli.printing import clean, duration, print_json, print_table, say
 from solar_cli.experiment.estimates import Estimate
 from solar_cli.experiment.matrix import Action, Plan
 from solar_cli.experiment.scheduler import Result, default_workers
+from solar_cli.store.records import Outcome
 
 
 def planned(plan: Plan) -> dict[str, Any]:
@@ -78,11 +79,16 @@ def print_estimates(
         else "a time that is unknown until one such cell has finished"
     )
     say(
-        f"{len(work)} of {len(plans)} cells to compute, {at_once} at a time: {time}; "
+        f"{len(work)} of {counted(len(plans))} to compute, {at_once} at a time: {time}; "
         "nothing was started"
         if work
-        else f"all {len(plans)} cells need nothing; nothing was started"
+        else f"{counted(len(plans))} and nothing to compute; nothing was started"
     )
+
+
+def counted(cells: int) -> str:
+    """``1 cell`` or ``2 cells``."""
+    return f"{cells} cell{'s' * (cells != 1)}"
 
 
 def mebibytes(size: int | None) -> str:
@@ -127,8 +133,15 @@ def print_results(results: Sequence[Result], json: bool, db: str | None) -> None
             "Not finished",
         )
     say("next:")
+    if any(_stopped(result) for result in results):
+        say("  the same command again, which goes on from here")
     for command in next_commands(results, db):
         say(f"  {command}")
+
+
+def _stopped(result: Result) -> bool:
+    """Whether the cell is left as an interruption leaves it: begun, or still waiting."""
+    return result.outcome is Outcome.INTERRUPTED or (result.outcome is None and result.plan.is_work)
 
 
 def _kind(result: Result) -> str:

@@ -11,7 +11,7 @@ import math
 import os
 import sys
 import unicodedata
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,7 +41,7 @@ def console(*, error: bool = False) -> Console:
     from rich.console import Console
 
     stream = sys.stderr if error else sys.stdout
-    width = None if stream.isatty() else UNBOUNDED
+    width = None if stream.isatty() or os.environ.get("COLUMNS", "").isdecimal() else UNBOUNDED
     return Console(file=stream, width=width, highlight=False, markup=False, emoji=False)
 
 
@@ -55,8 +55,19 @@ def complain(line: object) -> None:
     sys.stderr.write(f"{clean(line)}\n")
 
 
-def table(columns: Sequence[str], rows: Iterable[Sequence[object]], title: str = "") -> Table:
-    """A Rich table; columns whose name ends in ``>`` are set to the right."""
+def table(
+    columns: Sequence[str],
+    rows: Iterable[Sequence[object]],
+    title: str = "",
+    *,
+    whole: Collection[str] = (),
+    cut: Collection[str] = (),
+) -> Table:
+    """A Rich table; columns whose name ends in ``>`` are set to the right.
+
+    Where it is narrow, text goes on in the next line, but in the columns ``whole`` it stays as it
+    is, and in the columns ``cut`` it ends in an ellipsis.
+    """
     from rich import box
     from rich.table import Table
     from rich.text import Text
@@ -66,7 +77,8 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[object]], title: str =
         made.add_column(
             name.rstrip(">"),
             justify="right" if name.endswith(">") else "left",
-            overflow="fold",
+            overflow="ellipsis" if name in cut else "fold",
+            no_wrap=name in (*whole, *cut),
             max_width=WIDEST,
         )
     for row in rows:

@@ -66,15 +66,27 @@ def row(event: Event) -> tuple[object, ...]:
     """What the live table says of a cell."""
     plan, message = event.plan, event.message
     if message is None:
-        return (plan.cell.title, "", f"0/{plan.target}", "", "starting", "")
+        return (plan.cell.title, "", f"{standing(event)[1]}/{plan.target}", "", "starting", "")
+    iteration, episodes = standing(event)
     return (
         plan.cell.title,
-        message.iteration,
-        f"{message.episodes}/{plan.target}",
+        iteration,
+        f"{episodes}/{plan.target}",
         headline(event),
         f"{message.activity} {message.fraction:.0%}" if message.fraction else message.activity,
         duration(event.seconds_left),
     )
+
+
+def standing(event: Event) -> tuple[int, int]:
+    """Iteration and episodes: what the worker says, or, before it has read its checkpoint, what
+    the store has."""
+    plan, message = event.plan, event.message
+    told = (0, 0) if message is None else (message.iteration, message.episodes)
+    goes_on = plan.action.value in ("resume", "continue")
+    if told == (0, 0) and goes_on and plan.record is not None:
+        return plan.record.iteration, plan.record.episodes
+    return told
 
 
 def headline(event: Event) -> str:
@@ -96,7 +108,7 @@ class Lines:
         """Hear an event."""
         key, message = event.plan.cell.hash, event.message
         if event.kind == "progress":
-            iteration = -1 if message is None else message.iteration
+            iteration = -1 if message is None else standing(event)[0]
             if self._iterations.get(key) == iteration:
                 return
             self._iterations[key] = iteration
@@ -108,10 +120,9 @@ def plain_line(event: Event) -> str:
     title, message, result = event.plan.cell.title, event.message, event.result
     if event.kind == "started":
         return f"{title}: started"
+    iteration, episodes = standing(event)
     where = (
-        ""
-        if message is None
-        else f"iteration {message.iteration}, {message.episodes}/{event.plan.target} episodes"
+        "" if message is None else f"iteration {iteration}, {episodes}/{event.plan.target} episodes"
     )
     if event.kind == "ended" and result is not None:
         outcome = "not started" if result.outcome is None else result.outcome.value
@@ -141,8 +152,8 @@ def json_line(event: Event) -> None:
             "cell": event.plan.cell.hash,
             "title": event.plan.cell.title,
             "target": event.plan.target,
-            "iteration": None if message is None else message.iteration,
-            "episodes": None if message is None else message.episodes,
+            "iteration": None if message is None else standing(event)[0],
+            "episodes": None if message is None else standing(event)[1],
             "headline": event.plan.cell.configuration.evaluation.headline,
             "value": None if message is None else message.headline,
             "activity": None if message is None else message.activity,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,19 +18,12 @@ from solar_cli.cli.options import (
     complete_task,
     complete_variant,
 )
+from solar_cli.cli.preflight import Device
 from solar_cli.errors import UsageError
 
 if TYPE_CHECKING:
     from solar_cli.settings import Cell
     from solar_cli.store.store import Store
-
-
-class Device(StrEnum):
-    """Where tensors live."""
-
-    AUTO = "auto"
-    CPU = "cpu"
-    CUDA = "cuda"
 
 
 def command(
@@ -94,22 +86,32 @@ def command(
       solar run --task nav --method solar --seeds 1 --variant smoke
     """
     from solar_cli.cli.plans import print_estimates, print_plans, print_results
+    from solar_cli.cli.preflight import (
+        require_device,
+        require_free_label,
+        require_learners,
+        require_tasks,
+    )
+    from solar_cli.cli.shadowing import tell_shadowed
     from solar_cli.experiment.matrix import plan
     from solar_cli.settings import parse_budget
 
     matrix = cells_of(tasks, methods, seeds, variant, sets or (), label)
     wanted = parse_budget(budget)
+    tell_shadowed(tasks)
     with planning_store(db) if dry_run else _store(db) as store:
         plans = plan(store, matrix, wanted, redo=redo, retry=retry)
+        work = [planned.cell for planned in plans if planned.is_work]
+        require_free_label(store, work, label)
+        require_tasks(work)
         if dry_run:
             from solar_cli.experiment.estimates import estimate
 
             print_estimates(plans, estimate(store, plans), workers, json)
             return
-        work = [planned for planned in plans if planned.is_work]
         if work:
             require_device(device)
-            require_simulators([planned.cell for planned in work])
+            require_learners(work)
         print_plans(plans, json)
 
         from solar_cli.cli.progress import watching
@@ -170,24 +172,3 @@ def planning_store(db: str | None) -> Iterator[Store]:
     else:
         with Store.open(db, read_only=True) as store:
             yield store
-
-
-def require_device(device: Device) -> None:
-    """Raise `UsageError` where the device that was asked for is missing."""
-    if device is not Device.CUDA:
-        return
-    import torch
-
-    if not torch.cuda.is_available():
-        raise UsageError(
-            "--device cuda: torch sees no GPU here; use --device cpu, or install a CUDA build"
-        )
-
-
-def require_simulators(cells: Sequence[Cell]) -> None:
-    """Raise `UsageError` where a task cannot be built: an unknown parameter, a missing library."""
-    from solar_cli.envs import build_task
-
-    wanted = {str(task): task for task in (cell.configuration.task for cell in cells)}
-    for task in wanted.values():
-        build_task(task)

@@ -14,7 +14,8 @@ from solar_cli.cli.options import (
     complete_task,
     complete_variant,
 )
-from solar_cli.cli.printing import print_json, print_table
+from solar_cli.cli.printing import print_json, print_table, say
+from solar_cli.errors import UsageError
 
 
 def command(
@@ -38,16 +39,25 @@ def command(
     Example:
       solar tasks nav --method solar --variant smoke
     """
+    from solar_cli.cli.shadowing import card_files, tell_shadowed
     from solar_cli.settings import card_names, load_card, resolve
 
     if name is not None:
         from solar_cli.cli.configuration import print_lines, resolved_lines
 
+        tell_shadowed([name])
         print_lines(
             resolved_lines(resolve(load_card(name), method, variant, sets or ()), method), json
         )
         return
-    cards = [load_card(known) for known in card_names()]
+    cards, faults = [], {}
+    found = [known for known in card_names() if card_files(known)]
+    tell_shadowed(found)
+    for known in found:
+        try:
+            cards.append(load_card(known))
+        except UsageError as error:
+            faults[known] = f"cannot be used: {error}"
     if json:
         print_json(
             [
@@ -61,6 +71,7 @@ def command(
                 }
                 for card in cards
             ]
+            + [{"task": known, "error": fault} for known, fault in faults.items()]
         )
         return
     print_table(
@@ -77,3 +88,5 @@ def command(
             for card in cards
         ],
     )
+    for known, fault in faults.items():
+        say(f"{known}: {fault}")

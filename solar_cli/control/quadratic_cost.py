@@ -96,8 +96,10 @@ def explained(model: QuadraticCost, states: Trajectories) -> float:
 
 
 def _r2(predicted: Tensor, observed: Tensor) -> float:
-    residual = (predicted - observed).square().sum()
-    return float(1 - residual / (observed - observed.mean()).square().sum().clamp_min(1e-12))
+    residual = (predicted - observed).square().mean()
+    spread = (observed - observed.mean()).square().mean()
+    # A cost that does not vary holds nothing to explain.
+    return float(1 - residual / spread) if spread > 1e-18 else 1.0
 
 
 def _fit_shared(

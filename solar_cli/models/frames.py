@@ -34,6 +34,11 @@ class FrameModel(nn.Module):
         shape = observation.frame_shape
         if settings.likelihood == "categorical" and observation.kind != "image":
             raise UsageError("a categorical likelihood needs images; choose another for states")
+        if settings.likelihood in ("bernoulli", "categorical") and settings.input != "unit":
+            raise UsageError(
+                f"representation.likelihood = {settings.likelihood!r} needs frames in [0, 1]: set "
+                "representation.input = 'unit'"
+            )
         self.register_buffer("frame_mean", torch.zeros(shape))
         self.register_buffer(
             "frame_scale", torch.ones(() if observation.kind == "image" else shape)
@@ -58,7 +63,11 @@ class FrameModel(nn.Module):
             self.log_variance = None
         hidden, last = build(settings.decoder, (settings.latent,), shape)
         # A decoder that ends in a frame is complete; otherwise one linear layer makes the frame.
-        if last == shape:
+        rectified = (
+            getattr(settings.decoder[-1] if settings.decoder else None, "activation", "none")
+            != "none"
+        )
+        if last == shape and not rectified:
             self.decoder = hidden
         else:
             self.decoder = nn.Sequential(

@@ -68,12 +68,18 @@ class Trainer:
             latent = model.networks.settings.latent
             batch = data.minibatch(self.settings, draws, latent, fine_tuning)
             weight = self.settings.kl_end if fine_tuning else self._kl_weight(share)
-            loss, terms = self._step(model, optimiser, batch, weight, data.weights(batch))
             running["step"] += 1
+            place = f"step {running['step']} of {name}"
+            try:
+                loss, terms = self._step(model, optimiser, batch, weight, data.weights(batch))
+            except torch.linalg.LinAlgError as error:  # type: ignore[attr-defined]
+                raise Diverged(f"{place}: {error}") from error
             self._smooth(running["terms"], terms)
-            if running["step"] % PULSE_STEPS == 0:
-                if not math.isfinite(float(loss)):
-                    raise Diverged(f"the loss at step {running['step']} of {name} is not finite")
+            pausing = running["step"] % PULSE_STEPS == 0
+            # Read now and then only: reading a number waits for the device.
+            if (pausing or running["step"] == steps) and not math.isfinite(float(loss)):
+                raise Diverged(f"{place}: the loss is not finite")
+            if pausing:
                 running["seconds"] += time.perf_counter() - last
                 last = time.perf_counter()
                 self.pulse(f"training the model ({name})", running["step"] / steps)

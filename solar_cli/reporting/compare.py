@@ -26,7 +26,7 @@ from solar_cli.reporting.statistics import (
     p_value,
     smallest_p,
 )
-from solar_cli.reporting.summary import CAVEAT, title
+from solar_cli.reporting.summary import caveats, title
 from solar_cli.reporting.tables import Table, bounded, interval, markdown, number, one_line
 from solar_cli.store.store import Store
 
@@ -245,7 +245,15 @@ def _table(pairs: list[Pair]) -> Table:
     said = (
         f"Final: mean over seeds of {title(first.measure, first.unit, first.better)}, at the "
         "episodes where the curve ends. Ratios of episodes are of the medians over seeds.",
-        CAVEAT,
+        *caveats(
+            one
+            for pair in pairs
+            for one in (
+                pair.difference_interval,
+                pair.improvement_interval,
+                *(ratio.interval for ratio in pair.ratios),
+            )
+        ),
         "Verdicts are of a permutation test at the 5 % level, for each pair on its own: of many "
         "pairs some are decided by chance.",
         *dict.fromkeys(note for pair in pairs for note in pair.notes),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,16 +63,25 @@ def chart(store: Store, curves: Sequence[Curve]) -> Chart:
         {name for column in columns for name in column},
         key=lambda name: (SPLITS.index(name[0]), name[1]),
     )
+    headlines = {curve.measure.headline for curve in curves}
     return Chart(
         tuple(curve.label for curve in curves),
         tuple(
             (
-                name.replace("_", " ") + (" (judged on the truth)" if split == "model" else ""),
+                _title(name, split, headlines),
                 tuple(column.get((split, name)) for column in columns),
             )
             for split, name in names
         ),
     )
+
+
+def _title(name: str, split: str, headlines: Collection[str]) -> str:
+    """The headline measure of the learner's own noisy episodes is not the headline: it says so."""
+    plain = name.replace("_", " ")
+    if split == "model":
+        return f"{plain} (judged on the truth)"
+    return f"{plain} ({split})" if name in headlines else plain
 
 
 def _vitals(store: Store, curve: Curve) -> dict[tuple[str, str], Vital]:

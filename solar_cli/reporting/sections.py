@@ -200,7 +200,9 @@ def _origin(provenance: Mapping[str, Any]) -> tuple[str, ...]:
     memory = hardware.get("memory_bytes")
     machine = [
         hardware.get("processor"),
-        f"{hardware['cores']} cores" if "cores" in hardware else None,
+        f"{hardware['cores']} core{'s' * (hardware['cores'] != 1)}"
+        if "cores" in hardware
+        else None,
         f"{memory / 2**30:.0f} GiB" if memory else None,
         *hardware.get("gpus", []),
         hardware.get("system"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -19,10 +19,10 @@ from solar_cli.reporting.tables import Table, bounded, interval, number
 from solar_cli.store.records import State
 from solar_cli.store.store import Store
 
-CAVEAT = (
-    "Intervals are 95 % stratified bootstrap intervals over seeds. Below ten seeds they are too "
-    "short: 'covers' is the share of such intervals that held the truth when measured on synthetic "
-    "data, at worst."
+INTERVALS = "Intervals are 95 % stratified bootstrap intervals over seeds."
+COVERS = (
+    "Below ten seeds they are too short: 'covers' is the share of such intervals that held the "
+    "truth when measured on synthetic data, at worst."
 )
 LEVEL_NOTE = (
     "Episodes to a level: median over seeds of the first evaluation that reaches it, with the "
@@ -121,7 +121,7 @@ def table(problem: Problem, summaries: list[Summary]) -> Table:
             summary.label,
             seeds(summary),
             str(summary.episodes),
-            f"{number(summary.mean)} ± {number(summary.std)}",
+            mean_and_spread(summary),
             f"{number(summary.iqm)} {interval(summary.interval)}",
             *(
                 f"{bounded(level.episodes)} ({level.reached}/{summary.seeds})"
@@ -134,8 +134,23 @@ def table(problem: Problem, summaries: list[Summary]) -> Table:
             row.append("-" if peak is None else f"{peak / 2**20:.0f} MiB")
         rows.append(tuple(row))
     said = [note for summary in summaries for note in summary.notes]
-    said += [CAVEAT] + [LEVEL_NOTE] * bool(measure.levels)
+    said += caveats(summary.interval for summary in summaries)
+    said += [LEVEL_NOTE] * bool(measure.levels)
     return Table(tuple(columns), tuple(rows), tuple(said))
+
+
+def caveats(intervals: Iterable[Interval | None]) -> list[str]:
+    """What to know of the intervals that are shown; nothing where there is none."""
+    shown = [one for one in intervals if one is not None]
+    if not shown:
+        return []
+    covers = any(one.coverage is not None for one in shown)
+    return [f"{INTERVALS} {COVERS}" if covers else INTERVALS]
+
+
+def mean_and_spread(summary: Summary) -> str:
+    """``0.3 ± 0.1``; of a single seed, which has no spread, ``0.3 ± –``."""
+    return f"{number(summary.mean)} ± {number(summary.std) if summary.seeds > 1 else '–'}"
 
 
 def title(measure: str, unit: str, better: str) -> str:
@@ -166,8 +181,8 @@ def line(problem: Problem, summary: Summary) -> str:
     measure = problem.measure
     unit = f" {measure.unit}" if measure.unit else ""
     return (
-        f"{problem.title} {summary.label}: {measure.headline} {number(summary.mean)} ± "
-        f"{number(summary.std)}{unit} after {summary.episodes} episodes, seeds: {seeds(summary)}, "
+        f"{problem.title} {summary.label}: {measure.headline} {mean_and_spread(summary)}"
+        f"{unit} after {summary.episodes} episodes, seeds: {seeds(summary)}, "
         f"code: {', '.join(summary.codes) or 'unknown'}"
     )
 

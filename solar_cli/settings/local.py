@@ -33,7 +33,9 @@ class Representation(Settings):
     """Recognition model e(s) and observation model f(z) (section 3)."""
 
     latent: int = setting(8, "dimensions of the latent block of one frame", "App. D", ge=1)
-    encoder: tuple[Layer, ...] = setting(KEY_POINTS, "recognition network, applied to each frame")
+    encoder: tuple[Layer, ...] = setting(
+        KEY_POINTS, "recognition network, applied to each frame", min_length=1
+    )
     head: Literal["linear", "none"] = setting(
         "linear", "linear map from the last layer to the latent mean, or the layer itself"
     )

@@ -25,6 +25,7 @@ def solar(
     monkeypatch.setattr("solar_cli.experiment.matrix.code", lambda: CODE)
     monkeypatch.delenv("SOLAR_DB", raising=False)
     monkeypatch.delenv("SOLAR_HOME", raising=False)
+    monkeypatch.delenv("COLUMNS", raising=False)
 
     def call(*arguments: object) -> Done:
         capsys.readouterr()

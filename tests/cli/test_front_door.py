@@ -176,3 +176,30 @@ def test_the_shell_completes_names_of_tasks_methods_and_variants(
     line: str, offered: set[str]
 ) -> None:
     assert set(complete(line).split()) == offered
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device of Linux")
+@pytest.mark.parametrize("command", ["status", "tasks", "tasks --json", "export", "methods"])
+def test_output_that_cannot_be_written_is_one_line(stored: Stored, command: str) -> None:
+    program = "import sys; from solar_cli.cli import main; sys.exit(main())"
+    pipeline = f'"$0" -c "$1" {command} --db "$2" > /dev/full'
+    done = subprocess.run(
+        ["bash", "-c", pipeline, sys.executable, program, str(stored.db)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1), done
+    assert "standard output" in done.stderr
+
+
+def test_a_cell_shown_to_a_reader_that_has_left_is_met_with_silence(stored: Stored) -> None:
+    program = "import sys; from solar_cli.cli import main; sys.exit(main())"
+    pipeline = f'"$0" -c "$1" show {stored.finished.hash} --db "$2" | true; exit ${{PIPESTATUS[0]}}'
+    done = subprocess.run(
+        ["bash", "-c", pipeline, sys.executable, program, str(stored.db)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (1, "")

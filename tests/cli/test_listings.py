@@ -239,3 +239,45 @@ def test_doctor_finds_this_machine_in_order(solar: Solar, stored: Stored, tmp_pa
     (tmp_path / "notes.txt").write_text("my notes\n" * 100)
     done = solar("doctor", "--db", tmp_path / "notes.txt")
     assert (done.code, "bad" in done.out) == (1, True)
+
+
+@pytest.mark.parametrize("width", [70, 80, 100])
+def test_a_narrow_status_keeps_a_line_a_cell_with_hash_and_state(
+    solar: Solar, stored: Stored, monkeypatch: pytest.MonkeyPatch, width: int
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(width))
+    lines = solar("status", "--db", stored.db).out.splitlines()
+    assert max(map(len, lines)) <= width
+    for cell, state in ((stored.interrupted, "interrupted"), (stored.diverged, "diverged")):
+        [line] = [line for line in lines if line.startswith(cell.hash[:8])]
+        assert state in line.split()
+        assert str(cell.seed) in line.split()
+
+
+def test_a_bad_card_does_not_hide_the_others(solar: Solar, tmp_path: Path) -> None:
+    (tmp_path / "tasks" / "folder.toml").mkdir(parents=True)
+    (tmp_path / "tasks" / "broken.toml").write_text("[task\n")
+    done = solar("tasks")
+    assert done.code == 0
+    assert "nav-fixed" in done.out
+    assert "folder" not in done.out
+    [line] = [line for line in done.out.splitlines() if line.startswith("broken")]
+    assert "not valid TOML" in line
+    entries = {entry["task"]: entry for entry in json.loads(solar("tasks", "--json").out)}
+    assert "not valid TOML" in entries["broken"]["error"]
+    assert "error" not in entries["nav"]
+
+
+def test_a_card_that_hides_a_built_in_one_is_told_of(solar: Solar, tmp_path: Path) -> None:
+    from solar_cli.settings import load_card
+
+    original = load_card("nav").path.read_text()
+    (tmp_path / "tasks").mkdir()
+    (tmp_path / "tasks" / "nav.toml").write_text(original)
+    run = ("run", "--method", "solar", "--dry-run", "--task")
+    for command in (("tasks",), ("tasks", "nav"), (*run, "nav")):
+        done = solar(*command)
+        assert (done.code, done.err.count("\n")) == (0, 1), done
+        assert "tasks/nav.toml is used instead of the built-in card 'nav'" in done.err
+    assert solar(*run, "nav-fixed").err == ""
+    assert solar(*run, "tasks/nav.toml").err == ""

@@ -178,3 +178,38 @@ def test_a_log_has_a_line_an_iteration_not_one_a_message() -> None:
     for iteration in (0, 0, 1, 1, 1, 2):
         lines(Event("progress", plan, Message(iteration, 0, None, "training", 0.5)))
     assert [event.message.iteration for event in seen if event.message] == [0, 1, 2]
+
+
+def test_before_a_worker_has_read_its_checkpoint_the_stored_progress_is_told(
+    solar: Solar, stored: Stored
+) -> None:
+    from solar_cli.experiment.matrix import plan
+    from solar_cli.store.store import Store
+
+    with Store.open(str(stored.db), read_only=True) as store:
+        [resumed] = plan(store, [stored.interrupted], 16)
+    told = progress.plain_line(Event("progress", resumed, Message(0, 0, None, "starting", 0.0)))
+    assert "iteration 1, 8/16 episodes" in told
+    told = progress.plain_line(Event("progress", resumed, Message(2, 8, None, "training", 0.0)))
+    assert "iteration 2, 8/16 episodes" in told
+    assert progress.row(Event("started", resumed))[2] == "8/16"
+
+
+@pytest.mark.parametrize("end", [(Outcome.INTERRUPTED, "stopped"), (None, "not started")])
+def test_after_an_interruption_the_same_command_is_said_to_go_on(
+    solar: Solar,
+    tmp_path: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    end: tuple[Outcome | None, str],
+) -> None:
+    monkeypatch.setattr(scheduler, "run", fake_run([end]))
+    out = solar(*SMOKE, "--db", tmp_path / "solar.db").out
+    assert "same command" in out[out.index("next:") :].splitlines()[1]
+    monkeypatch.setattr(scheduler, "run", fake_run([(Outcome.FAILED, "broken")]))
+    assert "same command" not in solar(*SMOKE, "--db", tmp_path / "solar.db").out
+
+
+def test_one_cell_is_not_spoken_of_as_several(solar: Solar, stored: Stored) -> None:
+    out = solar(*SMOKE, "--dry-run", "--db", stored.db).out
+    assert "1 cell and nothing to compute" in out
+    assert "1 of 1 cell to compute" in solar(*SMOKE, "--seeds", "7:8", "--dry-run").out

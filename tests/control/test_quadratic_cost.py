@@ -206,7 +206,6 @@ def test_a_few_episodes_are_enough_to_judge(episodes):
     assert fit(states, per_time="never").r2 > 0.99
 
 
-@pytest.mark.xfail(strict=True, reason="_r2 divides rounding by the least variance")
 def test_a_constant_cost_is_explained():
     states = batch(lambda z, t: np.full(len(z), 3.0))
     pure = states._replace(costs=torch.full((N, T), 3.0).double())

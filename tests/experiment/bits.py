@@ -8,6 +8,9 @@ import torch
 
 from solar_cli.store.store import Store
 
+OF_THE_MACHINE = ("seconds", "peak_memory")
+"""how metrics begin that measure the machine, not what is learned"""
+
 
 def fingerprint(store: Store, cell: str) -> dict[str, str]:
     """SHA-256 of the metric rows and of the learner's final state; time and memory are left out."""
@@ -17,7 +20,7 @@ def fingerprint(store: Store, cell: str) -> dict[str, str]:
 def metric_digest(store: Store, cell: str, splits: tuple[str, ...] = ()) -> str:
     digest = hashlib.sha256()
     for row in store.metrics(hashes=[cell], splits=splits, values=True):
-        if row["name"].startswith(("seconds", "peak_memory")):
+        if row["name"].startswith(OF_THE_MACHINE):
             continue
         values = row["values"]
         parts = [row[key] for key in ("iteration", "episodes", "steps", "split", "name", "kind")]

@@ -7,7 +7,7 @@ from typing import Any
 import fake_method
 import numpy as np
 import pytest
-from bits import files_of, fingerprint, metric_digest, state_digest
+from bits import OF_THE_MACHINE, files_of, fingerprint, metric_digest, state_digest
 
 from solar_cli.envs.task import RowTask
 from solar_cli.episodes import Environment
@@ -396,7 +396,7 @@ def test_measures_that_raise_change_nothing_that_is_learned(
             kept = [
                 (row["iteration"], row["name"], row["value"])
                 for row in rows
-                if "distance" not in row["name"] and not row["name"].startswith("seconds")
+                if "distance" not in row["name"] and not row["name"].startswith(OF_THE_MACHINE)
             ]
             found.append((kept, state_digest(store, cell.hash, ("learner",))))
     assert found[0] == found[1]

@@ -64,18 +64,7 @@ def test_a_cell_has_its_bits(tmp_path, name):
     assert runs[2].bits() != runs[0].bits()
 
 
-@pytest.mark.parametrize(
-    "iteration",
-    [
-        1,
-        pytest.param(
-            2,
-            marks=pytest.mark.xfail(
-                strict=True, reason="they are collected again with the half-trained encoder"
-            ),
-        ),
-    ],
-)
+@pytest.mark.parametrize("iteration", [1, 2])
 def test_episodes_lost_inside_an_iteration_come_back_or_are_missed(tmp_path, iteration):
     """What a half-trained encoder would collect is not what its iteration has collected."""
     saved = []

@@ -162,14 +162,12 @@ def test_the_loss_is_that_of_the_cards_likelihood():
         assert float(loss.detach()) == pytest.approx(float(expected), rel=1e-4), likelihood
 
 
-@pytest.mark.xfail(strict=True, reason="FrameModel takes any last layer of the frame's shape")
 def test_a_vector_decoder_is_complete_only_with_a_linear_layer():
     """A hidden layer that happens to be as wide as the frame must not rectify the frame."""
     networks = model(STATES, decoder=({"kind": "linear", "width": 4},))
     assert float(networks.decoder(torch.randn(100, 3)).detach().min()) < 0
 
 
-@pytest.mark.xfail(strict=True, reason="FrameModel does not look at input and likelihood together")
 @pytest.mark.parametrize("likelihood", ["bernoulli", "categorical"])
 def test_a_likelihood_of_shares_refuses_standardised_frames(likelihood):
     with pytest.raises(UsageError, match="input"):

@@ -320,14 +320,12 @@ def test_a_loss_that_is_not_finite_is_divergence(value):
         trainer().fit(NAME, untrained("normal"), [broken(value)], 40)
 
 
-@pytest.mark.xfail(strict=True, reason="the next step's Cholesky factor raises before the check")
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_divergence_is_seen_before_the_factor_breaks(value):
     with pytest.raises(Diverged):
         trainer().fit(NAME, untrained("linear"), [broken(value)], 40)
 
 
-@pytest.mark.xfail(strict=True, reason="the loss is looked at every PULSE_STEPS steps only")
 def test_divergence_in_the_last_steps_is_seen():
     assert training.PULSE_STEPS > 3
     with pytest.raises(Diverged):

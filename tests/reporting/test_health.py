@@ -38,3 +38,12 @@ def test_a_representation_that_its_method_calls_unhealthy_is_warned_of(tmp_path)
         (problem,) = problems(store)
         shown = chart(store, problem.curves)
     assert shown.warnings == ["solar: the representation of at least one seed is not healthy"]
+
+
+def test_the_headline_of_noisy_episodes_is_told_from_the_headline(tmp_path):
+    with database(tmp_path) as store:
+        train = {"final_distance": [0.7], "kl": [1.0]}
+        compute(store, cell(seed=0), [1.0, 0.5], train=train)
+        (problem,) = problems(store)
+        shown = chart(store, problem.curves)
+    assert list(dict(shown.rows)) == ["final distance (train)", "kl"]

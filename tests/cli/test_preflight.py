@@ -1,0 +1,53 @@
+"""What a run would fail on is refused before it starts, by a dry run as well."""
+
+from pathlib import Path
+
+import pytest
+from scenario import Solar, Stored
+
+RUN = ("run", "--task", "nav", "--method", "solar", "--variant", "smoke", "--seeds", "7:8")
+
+
+@pytest.mark.parametrize("dry", [(), ("--dry-run",)])
+@pytest.mark.parametrize(
+    ("change", "parts"),
+    [
+        ("task.parameters.gaol=[0.0, 0.0]", ["'gaol'", "did you mean 'goal'"]),
+        ('evaluation.headline="final_distanc"', ["headline", "did you mean 'final_distance'"]),
+    ],
+)
+def test_a_task_that_does_not_hold_is_refused(
+    solar: Solar, stored: Stored, dry: tuple[str, ...], change: str, parts: list[str]
+) -> None:
+    before = stored.db.read_bytes()
+    solar(*RUN, "--set", change, *dry, "--db", stored.db).refused(*parts)
+    assert stored.db.read_bytes() == before
+
+
+@pytest.mark.parametrize("headline", ["return", "final_distance", "mean_distance"])
+def test_every_measure_can_be_the_headline(solar: Solar, stored: Stored, headline: str) -> None:
+    change = f'evaluation.headline="{headline}"'
+    assert solar(*RUN, "--set", change, "--dry-run", "--db", stored.db).code == 0
+
+
+def test_layers_that_do_not_fit_are_refused_before_a_cell_is_registered(
+    solar: Solar, stored: Stored
+) -> None:
+    before = stored.db.read_bytes()
+    layers = 'methods.solar.representation.encoder=[{kind="unshuffle", factor=7}]'
+    solar(*RUN, "--set", layers, "--db", stored.db).refused("nav/solar", "7")
+    assert stored.db.read_bytes() == before
+
+
+def test_a_label_names_one_configuration(solar: Solar, stored: Stored, tmp_path: Path) -> None:
+    from solar_cli.settings import cells, load_card
+    from solar_cli.store.store import Store
+
+    change, other = "task.horizon=9", "task.horizon=8"
+    with Store.open(str(stored.db)) as store:
+        store.add(cells(load_card("nav"), "solar", [7], "smoke", [change], "mine"))
+    labelled = (*RUN, "--label", "mine", "--dry-run", "--db", stored.db)
+    solar(*labelled, "--set", other).refused("--label 'mine'", "another label", "solar rm")
+    assert solar(*labelled, "--set", change).code == 0
+    seed = ("--seeds", "8:9")
+    assert solar(*labelled, *seed, "--set", other).code == 0
