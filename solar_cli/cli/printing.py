@@ -11,7 +11,7 @@ import math
 import os
 import sys
 import unicodedata
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -60,26 +60,27 @@ def table(
     rows: Iterable[Sequence[object]],
     title: str = "",
     *,
-    whole: Collection[str] = (),
-    cut: Collection[str] = (),
+    cut_to: Mapping[str, int] | None = None,
 ) -> Table:
     """A Rich table; columns whose name ends in ``>`` are set to the right.
 
-    Where it is narrow, text goes on in the next line, but in the columns ``whole`` it stays as it
-    is, and in the columns ``cut`` it ends in an ellipsis.
+    A text that is longer than its column goes on in the next line. With ``cut_to``, the width of
+    each column, it is cut instead, and the table has no margin.
     """
     from rich import box
     from rich.table import Table
     from rich.text import Text
 
     made = Table(box=box.SIMPLE_HEAD, title=title or None, title_justify="left", pad_edge=False)
+    if cut_to is not None:
+        made.show_edge, made.padding = False, (0, 1, 0, 0)
     for name in columns:
         made.add_column(
             name.rstrip(">"),
             justify="right" if name.endswith(">") else "left",
-            overflow="ellipsis" if name in cut else "fold",
-            no_wrap=name in (*whole, *cut),
-            max_width=WIDEST,
+            overflow="fold" if cut_to is None else "ellipsis",
+            no_wrap=cut_to is not None,
+            max_width=WIDEST if cut_to is None else cut_to[name],
         )
     for row in rows:
         made.add_row(*(Text("" if value is None else clean(value)) for value in row))

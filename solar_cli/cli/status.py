@@ -10,22 +10,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from solar_cli.cli.options import AsJson, Database, Methods, Tasks, Variants
-from solar_cli.cli.printing import UNBOUNDED, console, print_json, say, table
+from solar_cli.cli.printing import console, print_json, say
 
 if TYPE_CHECKING:
-    from rich.console import Console, RenderableType
-    from rich.table import Table
+    from rich.console import RenderableType
 
     from solar_cli.cli.selection import Line
 
 PERIOD_SECONDS = 2.0
 """Between two looks at the database with ``--watch``."""
-SPARE = ("iteration>", "computing>")
-"""Columns that a narrow screen goes without, in this order."""
-CUT = ("variant", "note")
-"""Columns whose text a narrow screen cuts."""
-SHORTEST_NOTE = 12
-"""Characters, with the space beside them, below which a note says nothing."""
 
 
 def command(
@@ -90,36 +83,10 @@ def summary(lines: Sequence[Line]) -> RenderableType:
     from rich.console import Group
     from rich.text import Text
 
+    from solar_cli.cli.fitting import fitted
     from solar_cli.cli.selection import Line
 
     if not lines:
         return Text("no cells yet; start with: solar run --task nav --method solar --seeds 1")
-    shown = fitted(Line.COLUMNS, [line.shown() for line in lines], console())
+    shown = fitted(Line.COLUMNS, [line.shown() for line in lines], console().width)
     return Group(shown, Text(counts(lines)))
-
-
-def fitted(
-    columns: Sequence[str], rows: Sequence[Sequence[object]], screen: Console
-) -> RenderableType:
-    """The table; where the screen is too narrow for it, without some columns, and others cut."""
-    unbounded = screen.options.update(max_width=UNBOUNDED)
-    everything = table(columns, rows)
-    if screen.measure(everything, options=unbounded).maximum <= screen.width:
-        return everything
-    kept = list(columns)
-    without_note = [name for name in columns if name != "note"]
-
-    def made(names: Sequence[str], cut: Sequence[str] = ()) -> Table:
-        places = [columns.index(name) for name in names]
-        whole = [name for name in names if name != "headline measure>"]
-        return table(
-            names, [[row[place] for place in places] for row in rows], whole=whole, cut=cut
-        )
-
-    for name in SPARE:
-        if screen.measure(made(without_note), options=unbounded).maximum <= screen.width:
-            break
-        without_note.remove(name)
-        kept.remove(name)
-    left = screen.width - screen.measure(made(without_note), options=unbounded).maximum
-    return made(kept if left >= SHORTEST_NOTE else without_note, CUT)

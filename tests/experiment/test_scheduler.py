@@ -127,7 +127,7 @@ def test_a_second_stop_ends_workers_that_do_not_listen(
     monkeypatch.setattr(Store, "beat", beat)
     started = time.monotonic()
     [result] = stub("deaf")
-    assert time.monotonic() - started < 20  # the worker would sleep for a minute
+    assert time.monotonic() - started < 40  # the worker would sleep for a minute
     assert stops >= 2
     assert result.outcome is Outcome.INTERRUPTED
     assert store.find(result.plan.cell.hash).state is State.INTERRUPTED
@@ -137,9 +137,18 @@ def test_heartbeats_carry_what_the_worker_does(
     store: Store, stub: Callable[..., list[Result]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(supervision, "BEAT_SECONDS", 0.0)
+    beats = []
+    whole = Store.beat
+
+    def beat(self: Store, hash: str, attempt: int, activity: str, fraction: float) -> None:
+        whole(self, hash, attempt, activity, fraction)
+        beats.append((activity, fraction))
+
+    monkeypatch.setattr(Store, "beat", beat)
     [result] = stub("finish:0.5")
+    assert ("working", 0.5) in beats
     attempt = store.attempts(result.plan.cell.hash)[-1]
-    assert (attempt.activity, attempt.fraction) == ("working", 0.5)
+    assert (attempt.activity, attempt.fraction) == beats[-1]
     assert attempt.heartbeat > attempt.started
 
 
