@@ -174,7 +174,7 @@ def resolve(
     layers = [("card", _with_method(card, method_name))]
     layers += [(f"variant {variant}", _variant(card, variant))]
     layers += [("--set", assignment(text)) for text in sets]
-    merged: Table = {}
+    merged: Table = {"method": _own_defaults(settings_class(entry))}
     origins: dict[str, str] = {}
     for origin, layer in layers:
         _check_methods(layer, origin, card)
@@ -197,6 +197,18 @@ def resolve(
             f"task {card.name!r} gives {configuration.task.observation.kind}: choose another"
         )
     return Resolved(configuration, origins)
+
+
+def _own_defaults(settings: type[BaseModel]) -> Table:
+    """What a method's class says of its nested settings, where it departs from their own defaults.
+
+    Laid below the card, so that a card's table for some of them does not undo the rest.
+    """
+    return {
+        name: field.default.model_dump(exclude_unset=True)
+        for name, field in settings.model_fields.items()
+        if isinstance(field.default, BaseModel) and field.default.model_fields_set
+    }
 
 
 def _changes(card: Card, variant: str, method_name: str) -> bool:

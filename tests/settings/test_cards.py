@@ -216,3 +216,10 @@ def check(subject: object, expected: list[str]) -> None:
 def one_line(error: UsageError) -> None:
     assert error.exit_code == 2
     assert "\n" not in str(error)
+
+
+def test_a_card_does_not_undo_what_a_method_says_of_its_nested_settings() -> None:
+    plain = resolve(load_card("nav"), "vae").configuration.method
+    assert plain.training.standard_normal == 0.0  # though the card has a training table
+    changed = resolve(load_card("nav"), "vae", sets=["methods.vae.local_fit.folds=2"])
+    assert (changed.configuration.method.local_fit.method, plain.local_fit.method) == ("gmm", "gmm")
