@@ -210,12 +210,13 @@ def _origin(provenance: Mapping[str, Any]) -> tuple[str, ...]:
     packages = dict(provenance.get("packages") or {})
     versions = [f"Python {provenance.get('python', '?')}"]
     versions += [f"{name} {version}" for name, version in packages.items()]
-    program, *words = str(provenance.get("command", "")).split(" ")
+    # Folders of whoever ran it concern no reader, and may hold a name.
+    words = [PurePath(word).name for word in str(provenance.get("command", "")).split(" ")]
     return (
         str(provenance.get("commit") or f"version {provenance.get('version', 'unknown')}"),
         f"yes, {str(provenance['diff_sha256'])[:12]}" if provenance.get("dirty") else "none",
         ", ".join(str(part) for part in machine if part),
         str(provenance.get("device", "")),
         ", ".join(versions),
-        " ".join([PurePath(program).name, *words]),
+        " ".join(words),
     )

@@ -36,7 +36,9 @@ def solar(installed: Path, folder: Path, *arguments: str) -> subprocess.Complete
         text=True,
         check=False,
         cwd=folder,
-        env={**os.environ, "PYTHONPATH": str(installed)},
+        # A parallel test runner sets COLUMNS, and tables would be cut.
+        env={k: v for k, v in os.environ.items() if k != "COLUMNS"}
+        | {"PYTHONPATH": str(installed)},
     )
 
 
