@@ -110,6 +110,7 @@ def test_a_stop_lets_workers_save_and_starts_no_other(
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL  # as it was before
 
 
+@pytest.mark.quiet
 def test_a_second_stop_ends_workers_that_do_not_listen(
     store: Store, stub: Callable[..., list[Result]], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -216,6 +216,7 @@ def test_workers_of_their_own_process_end_as_they_say(store: Store, make_cells: 
     assert {"commit", "dirty", "packages", "hardware", "command"} <= set(provenance)
 
 
+@pytest.mark.quiet
 def test_a_stopped_worker_saves_and_the_next_run_goes_on(
     store: Store, make_cells: MakeCells
 ) -> None:

@@ -124,11 +124,15 @@ def test_the_policys_std_stays_within_its_bounds(tmp_path, name):
 
 
 @both
-def test_the_kl_bound_is_kept_and_scaled_by_the_step(tmp_path, name):
+def test_the_kl_bound_is_kept_and_scaled_by_the_step(tmp_path, monkeypatch, name):
+    calls = spied(monkeypatch, "improve_policy")
     run = Run(tmp_path, name, "update.kl_step=0.3").iterate(1, 3)
-    for metrics in run.metrics:
-        assert metrics["policy_kl"] <= 0.3 * 6 * metrics["step_multiplier"] * (1 + 1e-9)
-        assert metrics["policy_kl"] > 0
+    bounds = [max_kl for _, _, _, max_kl, _ in calls]
+    multipliers = [metrics["step_multiplier"] for metrics in run.metrics]
+    assert bounds == pytest.approx([0.3 * 6 * multiplier for multiplier in multipliers])
+    assert len(set(multipliers)) > 1
+    for metrics, bound in zip(run.metrics, bounds, strict=True):
+        assert 0 < metrics["policy_kl"] <= bound * (1 + 1e-9)
 
 
 def test_without_a_kl_bound_the_update_is_the_unconstrained_one(tmp_path, monkeypatch):

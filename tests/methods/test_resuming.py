@@ -6,13 +6,15 @@ from method_runs import Run
 from solar_cli.errors import SolarError
 
 FINE_TUNING = ("training.fine_tune_steps=8", "training.fine_tune_rate=0.003")
+FLOORS = ("update.early_updates=1", "update.std_floor=[0.95, 0.3]", "update.kl_step=5.0")
+"""The number of updates so far shows in the policy's std."""
 
 
 @pytest.mark.parametrize(
     ("name", "sets", "pulses"),
     [
         ("solar", FINE_TUNING, 3 + 2 + 2),
-        ("solar", ("training.attempts=2",), 2 * 3),
+        ("solar", ("training.attempts=2", *FLOORS), 2 * 3),
         ("solar", ('dynamics.factors="varying"', 'dynamics.rows="all"'), 3),
         ("vae", FINE_TUNING, 3 + 2 + 2),
     ],
@@ -36,13 +38,12 @@ def test_a_run_interrupted_at_any_pulse_ends_with_the_same_bits(tmp_path, name, 
 
 @pytest.mark.parametrize("name", ["solar", "vae"])
 def test_a_run_interrupted_between_iterations_ends_with_the_same_bits(tmp_path, name):
-    whole = Run(tmp_path / "whole", name)
-    parts = Run(tmp_path / "parts", name).iterate(1, 1)
-    assert parts.state() is not None
+    whole = Run(tmp_path / "whole", name, *FLOORS)
+    parts = Run(tmp_path / "parts", name, *FLOORS).iterate(1, 1)
     whole.iterate(1, 3)
     for iteration in (2, 3):
         state = parts.state()
-        parts = Run(tmp_path / "parts", name).restore(state).iterate(iteration, iteration)
+        parts = Run(tmp_path / "parts", name, *FLOORS).restore(state).iterate(iteration, iteration)
         assert repr(parts.metrics[0]) == repr(whole.metrics[iteration - 1])
     assert parts.bits() == whole.bits()
 

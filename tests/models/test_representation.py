@@ -211,6 +211,19 @@ def test_first_weights_depend_on_seed_and_attempt_alone():
     assert torch.equal(trained.embed(FIRST), again.embed(FIRST))
 
 
+@pytest.mark.filterwarnings("ignore:no representation")
+def test_every_attempt_starts_from_weights_of_its_own(monkeypatch):
+    starts, fit = [], training.Trainer.fit
+
+    def watched(self, name, model, *rest, **more):
+        starts.append(digest([p.detach() for p in model.networks.parameters()]))
+        return fit(self, name, model, *rest, **more)
+
+    monkeypatch.setattr(training.Trainer, "fit", watched)
+    make(Scores(0.0)).update(Collected(FIRST))
+    assert len(set(starts)) == len(starts) == 3
+
+
 # Stopping and going on
 
 

@@ -142,6 +142,22 @@ def test_seed_and_name_key_the_draws():
     assert len(found) == 3
 
 
+def test_every_step_of_every_run_has_draws_of_its_own():
+    noises = []
+    for name in ("a", "b"):
+        model = untrained()
+        loss = model.loss
+
+        def watched(batch, weight, loss=loss):
+            noises.append(batch.noise)
+            return loss(batch, weight)
+
+        model.loss = watched  # type: ignore[method-assign]
+        trainer().fit(name, model, [EPISODES], 4)
+    assert len(noises) == 8
+    assert len({digest(noise) for noise in noises}) == 8
+
+
 # What a step draws
 
 
