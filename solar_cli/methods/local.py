@@ -5,6 +5,7 @@ A local method gives `make_prior` (or another representation) and `iterate`.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import replace
 from typing import Any
 
@@ -30,7 +31,7 @@ from solar_cli.settings.local import LocalMethod
 from solar_cli.streams import Streams
 
 
-class LocalLearner:
+class LocalLearner(ABC):
     """A representation, a linear-Gaussian policy on its states, and the rules around an update."""
 
     def __init__(
@@ -56,9 +57,9 @@ class LocalLearner:
         self.trust_region = TrustRegion(StepSize(low=low, high=high))
         self.updates = 0
 
+    @abstractmethod
     def make_prior(self) -> Prior:
         """The prior over latents that the representation is trained with."""
-        raise NotImplementedError
 
     @property
     def policy(self) -> LatentPolicy:
