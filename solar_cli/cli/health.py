@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
-import ctypes.util
 import os
 import platform
 import shutil
@@ -15,7 +13,7 @@ from enum import StrEnum
 from importlib.metadata import version
 from pathlib import Path
 
-from solar_cli.errors import SolarError
+from solar_cli.errors import SolarError, UsageError
 
 LEAST_FREE = 2 * 2**30
 """Bytes of free disk from which there is a warning: some ten cells at their largest."""
@@ -128,24 +126,12 @@ def folder(home: Path) -> Iterator[Check]:
 
 
 def gl() -> Check:
-    """The libraries that MuJoCo can draw images with; only tasks in pixels of MuJoCo need one."""
-    usable = [name for name in ("EGL", "OSMesa") if _loads(name)]
-    if os.environ.get("DISPLAY") and _loads("GL"):
-        usable.append("GLX")
-    chosen = os.environ.get("MUJOCO_GL", "not set")
-    if usable:
-        return Check("GL", f"{', '.join(usable)} can be loaded; MUJOCO_GL is {chosen}")
-    return Check(
-        "GL",
-        f"neither EGL, OSMesa nor a display; MUJOCO_GL is {chosen}",
-        Verdict.DOUBTFUL,
-        "for MuJoCo tasks in pixels install libegl1 or libosmesa6",
-    )
+    """Whether MuJoCo draws; only tasks in pixels of MuJoCo need it to."""
+    from solar_cli.envs.offscreen import load_mujoco, make_renderer
 
-
-def _loads(library: str) -> bool:
-    found = ctypes.util.find_library(library)
     try:
-        return found is not None and ctypes.CDLL(found) is not None
-    except OSError:
-        return False
+        mujoco = load_mujoco()
+        make_renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8).render()
+    except UsageError as error:
+        return Check("GL", str(error), Verdict.DOUBTFUL, "only tasks of MuJoCo need this")
+    return Check("GL", f"MuJoCo draws, MUJOCO_GL is {os.environ.get('MUJOCO_GL') or 'not set'}")
