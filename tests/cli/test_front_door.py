@@ -14,7 +14,7 @@ from solar_cli import cli
 from solar_cli.errors import SolarError
 
 README = Path(__file__).parent.parent.parent / "README.md"
-HEAVY = ("torch", "scipy", "matplotlib", "pandas", "gymnasium")
+HEAVY = ("torch", "scipy", "matplotlib", "pandas", "gymnasium", "mujoco")
 COMMANDS = sorted(command.name for command in cli.app.registered_commands if command.name)
 
 

@@ -5,6 +5,7 @@ import warnings
 import gymnasium
 import numpy as np
 import pytest
+from drawing import skip_if_it_cannot_be_drawn
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
@@ -14,10 +15,13 @@ from solar_cli.envs.task import RowTask
 from solar_cli.settings import load_card
 
 ROWS = 5
+SHAPES = {"nav": (2, 32, 32), "nav-fixed": (2, 32, 32), "reacher": (4 * 3, 64, 64)}
+"""card -> window x channels, rows and columns"""
 
 
 @pytest.fixture(params=sorted(IDS))
 def name(request):
+    skip_if_it_cannot_be_drawn(task_settings(IDS[request.param]))
     return request.param
 
 
@@ -103,7 +107,7 @@ def test_each_id_is_its_card(name):
     task = load_card(IDS[name]).task
     env = gymnasium.make(name)
     assert env.spec.max_episode_steps == task.horizon
-    assert env.observation_space == gymnasium.spaces.Box(0, 255, (2, 32, 32), np.uint8)
+    assert env.observation_space == gymnasium.spaces.Box(0, 255, SHAPES[IDS[name]], np.uint8)
     assert env.action_space == gymnasium.spaces.Box(-1, 1, (2,), np.float32)
 
 
@@ -124,7 +128,8 @@ def test_an_episode_is_truncated_at_the_horizon_and_pays_minus_the_cost(name):
         before = info["distance"]
         action = env.action_space.sample()
         _, reward, terminated, truncated, info = env.step(action)
-        paid = before**2 + 0.001 * float(np.sum(action.astype(float) ** 2))
+        effort = float(np.sum(action.astype(float) ** 2))
+        paid = before + effort if IDS[name] == "reacher" else before**2 + 0.001 * effort
         assert reward == pytest.approx(-paid, rel=1e-12)
         assert not terminated
         assert truncated == (step == 50)
@@ -154,7 +159,8 @@ def test_a_person_sees_a_picture(name):
     env = gymnasium.make(name, render_mode="rgb_array")
     env.reset(seed=0)
     image = env.render()
-    assert (image.shape, image.dtype) == ((256, 256, 3), np.uint8)
+    side = 8 * SHAPES[IDS[name]][-1]
+    assert (image.shape, image.dtype) == ((side, side, 3), np.uint8)
     batched = gymnasium.make_vec(name, num_envs=3, render_mode="rgb_array")
     batched.reset(seed=0)
     images = batched.render()
