@@ -36,11 +36,10 @@ def log_normaliser(
 
 
 def expected_log_det_precision(
-    Psi: Float[Tensor, "*batch d d"], nu: Float[Tensor, "*batch"]
+    log_det_Psi: Float[Tensor, "*batch"], d: int, nu: Float[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch"]:
     """E log|S^-1|."""
-    d = Psi.shape[-1]
-    return multivariate_digamma(nu / 2, d) - log_determinant(Psi) + d * math.log(2)
+    return multivariate_digamma(nu / 2, d) - log_det_Psi + d * math.log(2)
 
 
 def kl_divergence(

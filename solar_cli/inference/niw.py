@@ -63,15 +63,17 @@ def initial_statistics(
 
 
 def expected_initial_kl(
-    q: NIW, z_mean: Float[Tensor, "*#sample d"], z_variance: Float[Tensor, "*#sample d"]
-) -> Float[Tensor, "*sample"]:
-    """E_q(mu,Sigma) KL(N(z_mean, diag z_variance) || N(mu, Sigma)) in nats, for each sample.
+    parameters: RegressionStatistics,
+    starts: RegressionStatistics,
+    log_variance: Float[Tensor, "*batch"],
+) -> Float[Tensor, "*batch"]:
+    """Sum over starts of E_q(mu,Sigma) KL(N(z_mean, diag z_variance) || N(mu, Sigma)) in nats.
 
-    The t = 0 term of the latent KL, which the paper's ELBO leaves out; differentiable in both.
+    The t = 0 term of the latent KL, which the paper's ELBO leaves out. ``parameters`` are natural
+    ones; ``starts`` and ``log_variance`` are as `mniw.expected_transition_kl` has them.
     """
-    one = torch.ones_like(z_mean[..., :1])
-    expected = mniw.expected_statistics(_as_regression(q))
-    return mniw.expected_transition_kl(expected, z_mean, z_variance, one, torch.zeros_like(one))
+    expected = mniw.expected_statistics(parameters)
+    return mniw.expected_transition_kl(expected, starts, log_variance)
 
 
 def posterior(prior: NIW, statistics: RegressionStatistics) -> NIW:

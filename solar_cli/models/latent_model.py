@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -10,10 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from solar_cli.episodes import Episodes
-from solar_cli.models.frames import FrameModel
+from solar_cli.models.frames import CHUNK, FrameModel
 from solar_cli.models.priors import Prior, Segments, standard_normal_kl
-
-CHUNK = 512  # frames encoded at once: bounds memory, loses no speed
 
 
 class Minibatch(NamedTuple):
@@ -38,27 +36,25 @@ class LatentModel:
         self.prior = prior
         self.standard_normal = standard_normal
 
-    def loss(
-        self, batch: Minibatch, kl_weight: float
-    ) -> tuple[Tensor, Segments, dict[str, Tensor]]:
-        """The negative ELBO in nats a frame, the factors q(z | s), and the ELBO's terms."""
+    def loss(self, batch: Minibatch, kl_weight: float) -> tuple[Tensor, Any, dict[str, Tensor]]:
+        """The negative ELBO in nats a frame, what the prior learns from, and the ELBO's terms."""
         scaled = self.networks.scaled(batch.frames.flatten(0, 1))
         mean, variance = self.networks.encode(scaled)
         sample = mean + variance.sqrt() * batch.noise.flatten(0, 1)
         reconstruction = self.networks.reconstruction_loss(
-            sample[batch.decoded], scaled[batch.decoded]
+            sample.index_select(0, batch.decoded), scaled.index_select(0, batch.decoded)
         )
         shape = (*batch.frames.shape[:2], -1)
         segments = Segments(
             mean.view(shape).double(), variance.view(shape).double(), batch.actions, batch.start
         )
-        kl = self.prior.kl(segments)
-        total_kl = kl
+        statistics = self.prior.statistics(segments)
+        kl = self.prior.kl(statistics)
+        loss = reconstruction + kl_weight * kl
         if self.standard_normal:
             spread = standard_normal_kl(segments.mean, segments.variance).mean()
-            total_kl = kl + self.standard_normal * spread
-        loss = reconstruction + kl_weight * total_kl
-        return loss, segments, {"elbo_reconstruction": -reconstruction, "elbo_kl": kl}
+            loss = loss + kl_weight * self.standard_normal * spread
+        return loss, statistics, {"elbo_reconstruction": -reconstruction, "elbo_kl": kl}
 
     @torch.no_grad()
     def embed(self, frames: Tensor) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d"]]:

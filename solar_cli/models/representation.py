@@ -33,6 +33,7 @@ from solar_cli.streams import Streams
 ACTIVE_SHARE = 0.9  # of a latent's variance that its mean must carry for it to count as active
 LEAST_EXPLAINED = 0.5  # of the variance of each channel
 LEAST_COST_R2 = 0.5
+JUDGED_FRAMES = 2000  # decoded at most to judge a batch: bounds memory
 
 CostScore = Callable[["Representation", Episodes, Episodes], float]
 """R2 on the latter episodes of the cost that control would fit on the former."""
@@ -126,7 +127,7 @@ class Representation:
             metrics = self._fine_tune(experience.iteration, recent)
         else:
             metrics = self._judge(recent[-1])
-            self._model.prior.conclude(self._posterior(Episodes.joined(recent)))
+            self._conclude(recent)
         return {**metrics, **self._model.prior.metrics()}
 
     def _train_first(self, episodes: Episodes) -> dict[str, float]:
@@ -179,7 +180,11 @@ class Representation:
         self.moved = not self._alive(before.metrics) or self._alive(self._judge(newest))
         if not self.moved:
             self._take_up(before.parameters)
+            self._conclude(recent)
         return {**terms, **before.metrics, "fine_tuning_taken_back": float(not self.moved)}
+
+    def _conclude(self, batches: list[Episodes]) -> None:
+        self._model.prior.conclude(self._posterior(Episodes.joined(batches)))
 
     @staticmethod
     def _alive(metrics: dict[str, float]) -> bool:
@@ -193,11 +198,12 @@ class Representation:
         model = self._model
         segments = self._posterior(episodes)
         mean, variance = segments.mean.flatten(0, 1), segments.variance.flatten(0, 1)
-        scaled = model.networks.scaled(self._frames(episodes))
-        draws = self._streams.generator("judging").standard_normal(mean.shape)
-        sample = mean + variance.sqrt() * torch.from_numpy(draws).to(mean)
+        some = slice(None, None, -(-len(mean) // JUDGED_FRAMES))
+        scaled = model.networks.scaled(self._frames(episodes)[some])
+        draws = self._streams.generator("judging").standard_normal(mean[some].shape)
+        sample = mean[some] + variance[some].sqrt() * torch.from_numpy(draws).to(mean)
         reconstruction = model.networks.reconstruction_loss(sample.float(), scaled)
-        kl = model.prior.kl(segments)
+        kl = model.prior.kl(model.prior.statistics(segments))
         explained = explained_variance(model.networks.reconstruct(scaled), scaled)
         spread = mean.var(dim=0)
         carried = spread / (spread + variance.mean(dim=0))

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from solar_cli.episodes import Episodes
@@ -71,7 +72,7 @@ class Trainer:
             running["step"] += 1
             place = f"step {running['step']} of {name}"
             try:
-                loss, terms = self._step(model, optimiser, batch, weight, data.weights(batch))
+                loss, terms = self._step(model, optimiser, batch, weight, data.scale(batch))
             except torch.linalg.LinAlgError as error:  # type: ignore[attr-defined]
                 raise Diverged(f"{place}: {error}") from error
             self._smooth(running["terms"], terms)
@@ -95,15 +96,17 @@ class Trainer:
         optimiser: torch.optim.Adam,
         batch: Minibatch,
         kl_weight: float,
-        weights: tuple[float, float],
+        scale: float,
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """A step of Adam on the networks and one of natural gradient on the prior."""
-        loss, segments, terms = model.loss(batch, kl_weight)
+        loss, statistics, terms = model.loss(batch, kl_weight)
         optimiser.zero_grad()
         torch.autograd.backward(loss)
-        torch.nn.utils.clip_grad_norm_(model.networks.parameters(), self.settings.clip)
+        torch.nn.utils.clip_grad_norm_(
+            model.networks.parameters(), self.settings.clip, foreach=True
+        )
         optimiser.step()
-        model.prior.learn(Segments(*(part.detach() for part in segments)), weights)
+        model.prior.learn(statistics, scale)
         return loss.detach(), terms
 
     def _rate(self, share: float, fine_tuning: bool) -> float:
@@ -154,8 +157,8 @@ class Dataset:
         self.device = device
         self.episodes = Episodes.joined(batches)
         self.newest = len(batches[-1])
-        self.frames = torch.from_numpy(self.episodes.frames).to(device)
-        self.actions = torch.from_numpy(self.episodes.actions).to(device)
+        self.frames = torch.from_numpy(self.episodes.frames).to(device).flatten(0, 1)
+        self.actions = torch.from_numpy(self.episodes.actions).to(device).flatten(0, 1)
 
     def minibatch(
         self, settings: Training, stream: np.random.Generator, latent: int, favour_newest: bool
@@ -172,27 +175,24 @@ class Dataset:
         noise = stream.standard_normal((segments, length, latent), dtype=np.float32)
         decoded = stream.permutation(segments * length)
         decoded = decoded[: max(1, round(settings.decoded * segments * length))]
-        row = torch.from_numpy(rows).to(self.device)[:, None]
-        start = torch.from_numpy(starts).to(self.device)
-        times = start[:, None] + torch.arange(length, device=self.device)
+        places = (rows * frames + starts)[:, None] + np.arange(length)
+        moves = (rows * (frames - 1) + starts)[:, None] + np.arange(length - 1)
         return Minibatch(
-            self.frames[row, times],
-            self.actions[row, times[:, :-1]],
-            start,
+            self._taken(self.frames, places),
+            self._taken(self.actions, moves),
+            torch.from_numpy(starts).to(self.device),
             torch.from_numpy(noise).to(self.device),
             torch.from_numpy(decoded).to(self.device),
         )
 
-    def weights(self, batch: Minibatch) -> tuple[float, float]:
-        """B of Eq. 6: how many times a minibatch goes into the data, by transitions and by starts.
+    def _taken(self, flat: Tensor, places: NDArray[np.int64]) -> Tensor:
+        """Entries (S, n, ...) of an array whose episodes lie end to end."""
+        chosen = flat.index_select(0, torch.from_numpy(places.ravel()).to(self.device))
+        return chosen.view(*places.shape, *flat.shape[1:])
 
-        L frames hold L - W transitions between windows of W; a segment starts an episode with
-        probability 1 / (T - L + 2).
-        """
-        segments, length = batch.frames.shape[:2]
-        count, horizon, window = len(self.episodes), self.episodes.horizon, self.episodes.window
-        transitions = count * (horizon + 1 - window) / (segments * (length - window))
-        return transitions, count * (horizon - length + 2) / segments
+    def scale(self, batch: Minibatch) -> float:
+        """B of Eq. 6: episodes that a segment of the minibatch stands for."""
+        return len(self.episodes) / len(batch.start)
 
     def posterior(self, model: LatentModel) -> Segments:
         """q(z | s) of every episode."""

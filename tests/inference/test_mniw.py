@@ -98,7 +98,7 @@ def test_expected_statistics_are_means_over_samples():
     q = belief(3)
     F, S = sample(q, 40_000, np.random.default_rng(4))
     P = np.linalg.inv(S)
-    expected = mniw.expected_statistics(q)
+    expected = mniw.expected_statistics(mniw.natural(q))
     assert_mean(P, expected.precision)
     assert_mean(P @ F, expected.precision_F)
     assert_mean(F.swapaxes(1, 2) @ P @ F, expected.F_precision_F)
@@ -210,7 +210,7 @@ def test_elbo_at_the_posterior_is_the_evidence():
     prior, (x, y) = belief(26), pairs(27, 9)
     data = mniw.regression_statistics(x, y)
     q = mniw.posterior(prior, data)
-    e = mniw.expected_statistics(q)
+    e = mniw.expected_statistics(mniw.natural(q))
     fit = (
         -0.5 * (e.precision * data.yy).sum()
         + (e.precision_F * data.yx).sum()
@@ -237,19 +237,38 @@ def test_expected_transition_kl_is_the_mean_divergence_over_samples():
         + np.linalg.slogdet(S)[1]
         - np.log(y_variance).sum()
     )
-    means = map(torch.as_tensor, (y_mean, y_variance, x_mean, x_variance))
-    assert_mean(divergence, mniw.expected_transition_kl(mniw.expected_statistics(q), *means))
+    assert_mean(divergence, transition_kl(q, y_mean, y_variance, x_mean, x_variance))
+
+
+def transition_kl(q, y_mean, y_variance, x_mean, x_variance):
+    """Of one pair."""
+    y, y_var, x, x_var = (
+        torch.as_tensor(part)[..., None, :] for part in (y_mean, y_variance, x_mean, x_variance)
+    )
+    pair = mniw.regression_statistics(x, y, x_var, y_var)
+    expected = mniw.expected_statistics(mniw.natural(q))
+    return mniw.expected_transition_kl(expected, pair, y_var.log().sum((-2, -1)))
+
+
+def test_expected_transition_kl_is_a_sum_over_pairs():
+    q, rng = belief(28), np.random.default_rng(30)
+    parts = [torch.as_tensor(rng.uniform(0.2, 1, size=(5, size))) for size in (2, 2, 3, 3)]
+    y, y_variance, x, x_variance = parts
+    weights = torch.tensor([1.0, 2.0, 0.0, 0.5, 1.0]).double()
+    pairs = mniw.regression_statistics(x, y, x_variance, y_variance, weights)
+    logs = (weights * y_variance.log().sum(dim=-1)).sum()
+    together = mniw.expected_transition_kl(mniw.expected_statistics(mniw.natural(q)), pairs, logs)
+    apart = torch.stack([transition_kl(q, *(part[i] for part in parts)) for i in range(5)])
+    torch.testing.assert_close(together, (weights * apart).sum(), rtol=1e-12, atol=1e-12)
 
 
 def test_expected_transition_kl_has_the_gradients_of_finite_differences():
-    expected, rng = mniw.expected_statistics(belief(30, batch=(4,))), np.random.default_rng(31)
+    q, rng = belief(30, batch=(4,)), np.random.default_rng(31)
     arguments = [
         torch.tensor(rng.uniform(0.2, 1, size=(5, 4, size)), requires_grad=True)
         for size in (2, 2, 3, 3)
     ]
-    assert torch.autograd.gradcheck(
-        lambda *a: mniw.expected_transition_kl(expected, *a), arguments, eps=1e-6, atol=1e-6
-    )
+    assert torch.autograd.gradcheck(lambda *a: transition_kl(q, *a), arguments, eps=1e-6, atol=1e-6)
 
 
 def test_beliefs_of_time_steps_broadcast_against_samples():
@@ -257,7 +276,7 @@ def test_beliefs_of_time_steps_broadcast_against_samples():
     rng = np.random.default_rng(33)
     x, y = (torch.as_tensor(rng.uniform(0.5, 1, size=(5, 4, size))) for size in (3, 2))
     together = (
-        mniw.expected_transition_kl(mniw.expected_statistics(q), y, y, x, x),
+        transition_kl(q, y, y, x, x),
         mniw.predictive_log_likelihood(q, x, y),
     )
     for t in range(4):
@@ -265,7 +284,7 @@ def test_beliefs_of_time_steps_broadcast_against_samples():
         for n in range(5):
             a, b = x[n, t], y[n, t]
             apart = (
-                mniw.expected_transition_kl(mniw.expected_statistics(single), b, b, a, a),
+                transition_kl(single, b, b, a, a),
                 mniw.predictive_log_likelihood(single, a, b),
             )
             assert_same(apart, tuple(values[n, t] for values in together))
@@ -354,7 +373,7 @@ def test_centring_a_time_step_without_data_leaves_it_empty():
 def test_point_estimate_inverts_the_expected_precision():
     q = belief(41, batch=(3,))
     F, Sigma = mniw.point_estimate(q)
-    expected = mniw.expected_statistics(q).precision
+    expected = mniw.expected_statistics(mniw.natural(q)).precision
     assert_same((F, torch.linalg.inv(Sigma)), (q.M, expected))
 
 

@@ -364,10 +364,24 @@ def test_fine_tuning_that_kills_is_taken_back(monkeypatch):
     before = digest(model.state_dict()["parameters"]["networks"])
     answers = iter([True, False])
     monkeypatch.setattr(Representation, "_alive", staticmethod(lambda _: next(answers)))
-    metrics = model.update(Collected(FIRST, vector_episodes(TASK, 6, seed=7)))
+    second = vector_episodes(TASK, 6, seed=7)
+    metrics = model.update(Collected(FIRST, second))
     assert metrics["fine_tuning_taken_back"] == 1.0
     assert not model.moved
     assert digest(model.state_dict()["parameters"]["networks"]) == before
+    # What the newest episodes say of the dynamics is not taken back.
+    assert digest(own_factor(model)) == digest(conditioned(model, FIRST, second))
+
+
+def test_judging_decodes_a_bounded_number_of_frames(monkeypatch):
+    model, decoded = make(), []
+    model.update(Collected(FIRST))
+    monkeypatch.setattr(representation, "JUDGED_FRAMES", 20)
+    decoder = model._model.networks.decoder
+    decoder.register_forward_hook(lambda _, given, __: decoded.append(len(given[0])))
+    metrics = model.update(Collected(FIRST, vector_episodes(TASK, 6, seed=7)))
+    assert 10 < max(decoded) <= 20 < 6 * (TASK.horizon + 1)
+    assert math.isfinite(metrics["held_out_elbo"])
 
 
 def test_what_was_dead_before_fine_tuning_is_tuned_all_the_same(monkeypatch):
