@@ -18,7 +18,7 @@ from solar_cli.settings import TaskSettings
 
 __all__ = ["SIMULATORS", "Task", "build_task", "picture"]
 
-SIMULATORS = {"navigation": "solar_cli.envs.navigation"}
+SIMULATORS = {"navigation": "solar_cli.envs.navigation", "car": "solar_cli.envs.car"}
 """name on a card -> module, imported when used"""
 
 

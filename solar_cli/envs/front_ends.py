@@ -27,7 +27,12 @@ from solar_cli.settings.card import card_folders
 Array = NDArray[Any]
 Info = dict[str, Any]
 
-IDS = {"Solar/Navigation-v0": "nav", "Solar/NavigationFixed-v0": "nav-fixed"}
+IDS = {
+    "Solar/Navigation-v0": "nav",
+    "Solar/NavigationFixed-v0": "nav-fixed",
+    "Solar/Car-v0": "car",
+    "Solar/CarStates-v0": "car-states",
+}
 """Gymnasium id -> card"""
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}
 

@@ -43,7 +43,7 @@ def settings(request):
 
 
 def test_there_are_tasks():
-    assert {"nav", "nav-fixed"} <= set(CARDS)
+    assert {"nav", "nav-fixed", "car", "car-states"} <= set(CARDS)
 
 
 def test_shapes_types_and_finite_numbers(settings):
@@ -149,7 +149,7 @@ def test_rows_that_start_anew_leave_the_others_alone(settings):
 
 def test_simulators_need_no_heavy_package():
     code = (
-        "import sys, solar_cli.envs.navigation\n"
+        "import sys, solar_cli.envs.car, solar_cli.envs.navigation\n"
         "print({'torch', 'scipy', 'gymnasium', 'matplotlib', 'pandas'} & set(sys.modules))"
     )
     shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
