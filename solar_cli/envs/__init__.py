@@ -20,6 +20,7 @@ __all__ = ["SIMULATORS", "Task", "build_task", "picture"]
 
 SIMULATORS = {
     "navigation": "solar_cli.envs.navigation",
+    "car": "solar_cli.envs.car",
     "reacher": "solar_cli.envs.reacher",
 }
 """name on a card -> module, imported when used"""

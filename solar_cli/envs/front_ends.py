@@ -30,6 +30,8 @@ Info = dict[str, Any]
 IDS = {
     "Solar/Navigation-v0": "nav",
     "Solar/NavigationFixed-v0": "nav-fixed",
+    "Solar/Car-v0": "car",
+    "Solar/CarStates-v0": "car-states",
     "Solar/Reacher-v0": "reacher",
 }
 """Gymnasium id -> card"""

@@ -6,12 +6,18 @@ Pixel (r, c) is the point with row coordinate r and column coordinate c; row 0 i
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+Floats = NDArray[np.float64]
+
 PEAK = 255.0
 """brightness at the centre of a blob"""
+CHUNK_PIXELS = 15_000
+"""pixels of figures drawn at once: temporaries below 128 KiB, which malloc keeps in its heap"""
 
 
 def draw_blobs(images: NDArray[np.uint8], centres: NDArray[np.float64], deviation: float) -> None:
@@ -43,6 +49,110 @@ def _profiles(
     first = np.minimum(np.maximum(lowest, 0), pixels - size)
     offsets = (first - centres)[:, None] + np.arange(size)
     return first, np.exp(offsets * offsets * (-0.5 / deviation**2))
+
+
+class Box(NamedTuple):
+    """A filled rectangle of a figure; lengths in pixels."""
+
+    centre: tuple[float, float]
+    """ahead of the figure's centre, and to its left"""
+    half: tuple[float, float]
+    """half of its length, and of its width"""
+    grey: float
+    """0 to 255"""
+
+    @property
+    def reach(self) -> float:
+        """No pixel farther than this from the figure's centre shows it."""
+        sides = zip(self.centre, self.half, strict=True)
+        return math.hypot(*(abs(centre) + half + 0.5 for centre, half in sides))
+
+    def coverage(self, ahead: Floats, left: Floats) -> Floats:
+        """Share of each pixel that it covers: exact where its sides follow the pixels."""
+        return _overlap(ahead - self.centre[0], self.half[0]) * _overlap(
+            left - self.centre[1], self.half[1]
+        )
+
+
+class Disc(NamedTuple):
+    """A filled circle of a figure; lengths in pixels."""
+
+    centre: tuple[float, float]
+    """ahead of the figure's centre, and to its left"""
+    radius: float
+    grey: float
+    """0 to 255"""
+
+    @property
+    def reach(self) -> float:
+        """No pixel farther than this from the figure's centre shows it."""
+        return math.hypot(*self.centre) + self.radius + 0.5
+
+    def coverage(self, ahead: Floats, left: Floats) -> Floats:
+        """Share of each pixel that it covers, from the distance to its edge."""
+        ahead, left = ahead - self.centre[0], left - self.centre[1]
+        inside = self.radius + 0.5 - np.sqrt(ahead * ahead + left * left)
+        return np.minimum(np.maximum(inside, 0.0), 1.0)
+
+
+def draw_figure(
+    images: NDArray[np.uint8], centres: Floats, headings: Floats, figure: Sequence[Box | Disc]
+) -> None:
+    """Draw a rigid figure onto each image (N, H, W), in place: its parts one over the other.
+
+    ``centres`` (N, 2) are (row, column) in pixels. ``headings`` (N,) in radians turn what is ahead
+    from right (0) to up (pi/2). Edges are smooth: a pixel takes a part's grey by the share of it
+    that the part covers. Pixels out of reach stay as they are; a figure may lie partly or wholly
+    outside its image.
+    """
+    reach = max(part.reach for part in figure)
+    size = math.floor(2.0 * reach) + 1
+    # Temporaries that stay in the cache, and below what malloc asks the system for.
+    some = max(1, CHUNK_PIXELS // size**2)
+    for start in range(0, len(images), some):
+        chunk = slice(start, start + some)
+        _draw_figure(images[chunk], centres[chunk], headings[chunk], figure, reach, size)
+
+
+def _draw_figure(
+    images: NDArray[np.uint8],
+    centres: Floats,
+    headings: Floats,
+    figure: Sequence[Box | Disc],
+    reach: float,
+    size: int,
+) -> None:
+    top, rows = _places(centres[:, 0], reach, size, images.shape[1])
+    left, columns = _places(centres[:, 1], reach, size, images.shape[2])
+    windows = np.lib.stride_tricks.sliding_window_view(
+        images, (rows.shape[1], columns.shape[1]), axis=(1, 2), writeable=True
+    )
+    patch = np.arange(len(images)), top, left
+    down, across = rows[:, :, None], columns[:, None, :]
+    cos, sin = np.cos(headings)[:, None, None], np.sin(headings)[:, None, None]
+    ahead, leftwards = across * cos - down * sin, -across * sin - down * cos
+    pixels = windows[patch].astype(np.float64)
+    for part in figure:
+        pixels += part.coverage(ahead, leftwards) * (part.grey - pixels)
+    windows[patch] = np.rint(pixels).astype(np.uint8)
+
+
+def _places(
+    centres: Floats, reach: float, size: int, pixels: int
+) -> tuple[NDArray[np.intp], Floats]:
+    """First pixel (N,) within reach, and from there on each one's place, seen from the centre.
+
+    Written as pixel minus centre, so that a place does not depend on where a patch begins.
+    """
+    size = min(size, pixels)
+    lowest = np.ceil(centres - reach).astype(np.intp)
+    first = np.minimum(np.maximum(lowest, 0), pixels - size)
+    return first, (first[:, None] + np.arange(size)) - centres[:, None]
+
+
+def _overlap(places: Floats, half: float) -> Floats:
+    """Length of what a pixel at each place shares with the interval +-half."""
+    return np.minimum(np.maximum(half + 0.5 - np.abs(places), 0.0), min(1.0, 2.0 * half))
 
 
 def enlarge(images: NDArray[np.float64], factor: int) -> NDArray[np.float64]:

@@ -15,8 +15,6 @@ from solar_cli.envs.task import RowTask
 from solar_cli.settings import load_card
 
 ROWS = 5
-SHAPES = {"nav": (2, 32, 32), "nav-fixed": (2, 32, 32), "reacher": (4 * 3, 64, 64)}
-"""card -> window x channels, rows and columns"""
 
 
 @pytest.fixture(params=sorted(IDS))
@@ -57,17 +55,18 @@ def same(one, two):
         assert one == two
 
 
-def actions(steps):
+def actions(steps, bound=1.0):
     """Some beyond the bounds, in the action space's type."""
-    noise = np.random.default_rng(0).uniform(-1.3, 1.3, (steps, ROWS, 2))
+    noise = np.random.default_rng(0).uniform(-1.3 * bound, 1.3 * bound, (steps, ROWS, 2))
     return noise.astype(np.float32)
 
 
 def test_the_batched_form_equals_a_loop_over_singles(name):
     batched, loop = both(name)
+    task = load_card(IDS[name]).task
     same(batched.reset(seed=11), loop.reset(seed=11))
     restarts = 0
-    for action in actions(130):
+    for action in actions(2 * task.horizon + 30, task.action.bound):
         shown = batched.step(action)
         same(shown, loop.step(action))
         restarts += shown[3].sum()
@@ -80,7 +79,7 @@ def test_they_stay_equal_when_rows_end_at_different_times(name):
     batched, loop = both(name, max_episode_steps=20)
     same(batched.reset(seed=4), loop.reset(seed=4))
     seen = set()
-    for step, action in enumerate(actions(60)):
+    for step, action in enumerate(actions(60, load_card(IDS[name]).task.action.bound)):
         if step in (3, 9):
             mask = np.arange(ROWS) % (step - 1) == 0
             same(
@@ -106,9 +105,17 @@ def test_the_spaces_equal_those_of_a_loop(name):
 def test_each_id_is_its_card(name):
     task = load_card(IDS[name]).task
     env = gymnasium.make(name)
+    shown = {
+        "nav": gymnasium.spaces.Box(0, 255, (2, 32, 32), np.uint8),
+        "nav-fixed": gymnasium.spaces.Box(0, 255, (2, 32, 32), np.uint8),
+        "car": gymnasium.spaces.Box(0, 255, (4, 64, 64), np.uint8),
+        "reacher": gymnasium.spaces.Box(0, 255, (12, 64, 64), np.uint8),
+        "car-states": gymnasium.spaces.Box(-np.inf, np.inf, (9,), np.float32),
+    }
     assert env.spec.max_episode_steps == task.horizon
-    assert env.observation_space == gymnasium.spaces.Box(0, 255, SHAPES[IDS[name]], np.uint8)
-    assert env.action_space == gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+    assert env.observation_space == shown[IDS[name]]
+    bound = task.action.bound
+    assert env.action_space == gymnasium.spaces.Box(-bound, bound, (2,), np.float32)
 
 
 def test_an_id_means_its_own_card_in_every_folder(tmp_path, monkeypatch):
@@ -123,8 +130,9 @@ def test_an_id_means_its_own_card_in_every_folder(tmp_path, monkeypatch):
 
 def test_an_episode_is_truncated_at_the_horizon_and_pays_minus_the_cost(name):
     env = gymnasium.make(name)
+    horizon = load_card(IDS[name]).task.horizon
     _, info = env.reset(seed=2)
-    for step in range(1, 51):
+    for step in range(1, horizon + 1):
         before = info["distance"]
         action = env.action_space.sample()
         _, reward, terminated, truncated, info = env.step(action)
@@ -132,7 +140,7 @@ def test_an_episode_is_truncated_at_the_horizon_and_pays_minus_the_cost(name):
         paid = before + effort if IDS[name] == "reacher" else before**2 + 0.001 * effort
         assert reward == pytest.approx(-paid, rel=1e-12)
         assert not terminated
-        assert truncated == (step == 50)
+        assert truncated == (step == horizon)
 
 
 def test_an_id_is_found_by_module_and_name():
@@ -140,18 +148,35 @@ def test_an_id_is_found_by_module_and_name():
     assert isinstance(env.unwrapped, SingleEnv)
 
 
-def test_gymnasiums_checker_has_nothing_to_say(name):
+def accepted(name):
+    """What a checker may recommend: actions have their card's units, a state has no bounds."""
+    task = load_card(IDS[name]).task
+    messages = []
+    if task.action.bound != 1.0:
+        messages += [".*we recommend using a symmetric and normalized space"]
+        messages += ["We recommend you to use a symmetric and normalized Box action space"]
+    if task.observation.kind == "state":
+        messages += [".*A Box observation space (minimum|maximum) value is -?infin"]
+    elif task.observation.width < 36:
+        # The default network of Stable-Baselines needs 36 pixels; the paper's images have 32.
+        messages += ["The minimal resolution for an image is 36x36"]
+    return messages
+
+
+def test_gymnasiums_checker_has_nothing_else_to_say(name):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        for message in accepted(name):
+            warnings.filterwarnings("ignore", message=message)
         check_env(gymnasium.make(name).unwrapped)
 
 
-def test_stable_baselines_checker_says_only_that_images_are_small(name):
+def test_stable_baselines_checker_has_nothing_else_to_say(name):
     checker = pytest.importorskip("stable_baselines3.common.env_checker")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        # Its default network needs 36 pixels; the paper's images have 32.
-        warnings.filterwarnings("ignore", message="The minimal resolution for an image is 36x36")
+        for message in accepted(name):
+            warnings.filterwarnings("ignore", message=message)
         checker.check_env(gymnasium.make(name).unwrapped, skip_render_check=False)
 
 
@@ -159,7 +184,7 @@ def test_a_person_sees_a_picture(name):
     env = gymnasium.make(name, render_mode="rgb_array")
     env.reset(seed=0)
     image = env.render()
-    side = 8 * SHAPES[IDS[name]][-1]
+    side = 256 if "Navigation" in name else 512
     assert (image.shape, image.dtype) == ((side, side, 3), np.uint8)
     batched = gymnasium.make_vec(name, num_envs=3, render_mode="rgb_array")
     batched.reset(seed=0)

@@ -46,7 +46,7 @@ def settings(request):
 
 
 def test_there_are_tasks():
-    assert {"nav", "nav-fixed", "reacher"} <= set(CARDS)
+    assert {"nav", "nav-fixed", "car", "car-states", "reacher"} <= set(CARDS)
 
 
 def test_shapes_types_and_finite_numbers(settings):
@@ -152,7 +152,7 @@ def test_rows_that_start_anew_leave_the_others_alone(settings):
 
 def test_simulators_need_no_heavy_package():
     code = (
-        "import sys, solar_cli.envs.navigation, solar_cli.envs.reacher\n"
+        "import sys, solar_cli.envs.car, solar_cli.envs.navigation, solar_cli.envs.reacher\n"
         "heavy = {'torch', 'scipy', 'gymnasium', 'matplotlib', 'pandas', 'mujoco'}\n"
         "print(heavy & set(sys.modules))"
     )
