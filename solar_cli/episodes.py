@@ -213,12 +213,15 @@ class Environment:
                 streams.generator("noise") if noisy else None,
             )
             found = collected.episodes
-            stored = self._store(key, noisy, collected)
-            if entry is None:
-                self._ledger.append(stored)
-            elif stored["sha256"] != entry["sha256"]:
+            data = _packed(found)
+            made = self._described(key, noisy, collected, data)
+            # Compared as files: one that another zlib has compressed counts as another, too.
+            if entry is not None and made["sha256"] != entry["sha256"]:
                 # The policy is not the one that collected them: a training has gone on since.
                 raise self._lost(entry)
+            self._store(made["file"], data)
+            if entry is None:
+                self._ledger.append(made)
         self._kept[key] = found
         return found
 
@@ -276,19 +279,26 @@ class Environment:
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             return Episodes(**dict(arrays), window=self.settings.observation.window)
 
-    def _store(self, key: tuple[int, int], noisy: bool, collected: Evaluation) -> dict[str, Any]:
-        """Write the file whole or not at all, and describe it."""
-        episodes = collected.episodes
-        buffer = io.BytesIO()
-        np.savez_compressed(
-            buffer,
-            frames=episodes.frames,
-            actions=episodes.actions,
-            action_means=episodes.action_means,
-            costs=episodes.costs,
-        )
-        data = buffer.getvalue()
-        name = f"{key[0]:04d}-{key[1]}.npz"
+    def _described(
+        self, key: tuple[int, int], noisy: bool, collected: Evaluation, data: bytes
+    ) -> dict[str, Any]:
+        """The ledger's entry of episodes whose file holds ``data``."""
+        clipped = np.abs(collected.episodes.actions) >= self.settings.action.bound
+        return {
+            "iteration": key[0],
+            "call": key[1],
+            "noisy": noisy,
+            "episodes": len(collected.episodes),
+            "file": f"{key[0]:04d}-{key[1]}.npz",
+            "sha256": hashlib.sha256(data).hexdigest(),
+            "summary": {
+                **{name: float(values.mean()) for name, values in collected.summary().items()},
+                "clipped": float(clipped.mean()),
+            },
+        }
+
+    def _store(self, name: str, data: bytes) -> None:
+        """Write the file whole or not at all."""
         self._folder.mkdir(parents=True, exist_ok=True)
         beside = self._folder / f".{name}.{os.getpid()}"
         with beside.open("wb") as file:
@@ -296,19 +306,19 @@ class Environment:
             file.flush()
             os.fsync(file.fileno())
         beside.replace(self._folder / name)
-        clipped = np.abs(episodes.actions) >= self.settings.action.bound
-        return {
-            "iteration": key[0],
-            "call": key[1],
-            "noisy": noisy,
-            "episodes": len(episodes),
-            "file": name,
-            "sha256": hashlib.sha256(data).hexdigest(),
-            "summary": {
-                **{name: float(values.mean()) for name, values in collected.summary().items()},
-                "clipped": float(clipped.mean()),
-            },
-        }
+
+
+def _packed(episodes: Episodes) -> bytes:
+    """What the file of these episodes holds; equal episodes give equal bytes."""
+    buffer = io.BytesIO()
+    np.savez_compressed(
+        buffer,
+        frames=episodes.frames,
+        actions=episodes.actions,
+        action_means=episodes.action_means,
+        costs=episodes.costs,
+    )
+    return buffer.getvalue()
 
 
 class Experience:

@@ -330,12 +330,19 @@ def test_what_was_collected_again_is_there_for_later_processes(environment: Envi
     assert_equal_bits(again(fresh, 2).recent(2)[0], collected)
 
 
-def test_collecting_again_with_another_policy_is_refused(environment: Environment):
+@damaged
+def test_collecting_again_with_another_policy_is_refused_and_changes_no_file(
+    environment: Environment, damage
+):
     environment.begin(1)
     environment.collect(Pull(), 4)
-    files(environment)[0].unlink()
-    with pytest.raises((SolarError, OSError), match=r"0001-0\.npz"):
-        again(environment, 1).collect(Pull(gain=0.9), 4)
+    damage(files(environment)[0])
+    before = {file.name: file.read_bytes() for file in files(environment)}
+    fresh = again(environment, 1)
+    with pytest.raises(SolarError, match=r"0001-0\.npz.*restore the file"):
+        fresh.collect(Pull(gain=0.9), 4)
+    assert {file.name: file.read_bytes() for file in files(environment)} == before
+    assert fresh.state_dict() == environment.state_dict()
 
 
 @damaged
