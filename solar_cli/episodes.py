@@ -11,6 +11,7 @@ import hashlib
 import io
 import os
 import warnings
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +26,8 @@ from solar_cli.settings import TaskSettings
 from solar_cli.streams import Streams
 
 Floats = NDArray[np.float64]
+HELD = 8
+"""batches of frames held in memory: more than a local method at its defaults asks for in a turn"""
 
 
 class Policy(Protocol):
@@ -179,7 +182,7 @@ class Environment:
         self._streams = streams
         self._folder = folder
         self._ledger: list[dict[str, Any]] = []
-        self._kept: dict[tuple[int, int], Episodes] = {}
+        self._held: OrderedDict[tuple[int, int], Episodes] = OrderedDict()  # last asked for last
         self._call = 0
 
     @property
@@ -222,8 +225,7 @@ class Environment:
             self._store(made["file"], data)
             if entry is None:
                 self._ledger.append(made)
-        self._kept[key] = found
-        return found
+        return self._hold(key, found)
 
     def collected(self, iteration: int) -> Episodes:
         """All episodes of one iteration."""
@@ -252,16 +254,22 @@ class Environment:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Take up a ledger; the episodes are read when they are asked for."""
         self._ledger = [dict(entry) for entry in state["ledger"]]
-        self._kept.clear()
+        self._held.clear()
 
     def _get(self, entry: Mapping[str, Any]) -> Episodes:
         key = (int(entry["iteration"]), int(entry["call"]))
-        if key not in self._kept:
-            found = self._load(entry)
-            if found is None:
-                raise self._lost(entry)
-            self._kept[key] = found
-        return self._kept[key]
+        found = self._held[key] if key in self._held else self._load(entry)
+        if found is None:
+            raise self._lost(entry)
+        return self._hold(key, found)
+
+    def _hold(self, key: tuple[int, int], episodes: Episodes) -> Episodes:
+        """Keep episodes in memory until others have been asked for since."""
+        self._held[key] = episodes
+        self._held.move_to_end(key)
+        if len(self._held) > HELD:
+            self._held.popitem(last=False)
+        return episodes
 
     def _lost(self, entry: Mapping[str, Any]) -> SolarError:
         return SolarError(

@@ -2,6 +2,7 @@
 
 import copy
 import warnings
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import pytest
 
 from solar_cli.envs import build_task
 from solar_cli.episodes import (
+    HELD,
     Environment,
     Episodes,
     Evaluation,
@@ -358,6 +360,22 @@ def test_a_damaged_file_of_an_older_iteration_is_refused(environment: Environmen
     for ask in (lambda: fresh.recent(2), lambda: fresh.collected(1)):
         with pytest.raises((SolarError, OSError), match=r"0001-0\.npz.*damaged.*--redo"):
             ask()
+
+
+def test_frames_of_long_ago_leave_memory_and_are_read_again(environment: Environment):
+    held: list[weakref.ref[Episodes]] = []
+    starts = []
+    for iteration in range(1, HELD + 6):
+        environment.begin(iteration)
+        collected = environment.collect(Pull(), 2)
+        environment.collected(1)  # asked for every time
+        held.append(weakref.ref(collected))
+        starts.append(collected.frames[:, 0].copy())
+    del collected
+    alive = [iteration for iteration, batch in enumerate(held, 1) if batch() is not None]
+    assert alive == [1, *range(len(held) - HELD + 2, len(held) + 1)]
+    for found, start in zip(environment.recent(len(held)), starts, strict=True):
+        np.testing.assert_array_equal(found.frames[:, 0], start)
 
 
 def test_no_half_written_file_is_left(environment: Environment):
