@@ -29,6 +29,7 @@ from solar_cli.reporting.statistics import (
 from solar_cli.reporting.summary import caveats, title
 from solar_cli.reporting.tables import Table, bounded, interval, markdown, number, one_line
 from solar_cli.store.store import Store
+from solar_cli.wording import counted
 
 BASELINE = "solar"
 
@@ -208,7 +209,7 @@ def judge(better: float, p: float, left_seeds: int, right_seeds: int) -> tuple[V
     smallest = smallest_p(left_seeds, right_seeds)
     if smallest > LEVEL:
         return "undecided", (
-            f"{left_seeds} against {right_seeds} seeds cannot reach p <= {LEVEL}: "
+            f"{left_seeds} against {counted(right_seeds, 'seed')} cannot reach p <= {LEVEL}: "
             f"the smallest p is {smallest:.2g}"
         )
     if p > LEVEL:

@@ -20,6 +20,7 @@ from solar_cli.reporting.curves import Curve, Problem, SeedCurve
 from solar_cli.reporting.summary import title
 from solar_cli.reporting.tables import number
 from solar_cli.store.records import State
+from solar_cli.wording import counted
 
 FileFormat = Literal["png", "svg", "pdf"]
 
@@ -134,7 +135,7 @@ def label(curve: Curve) -> str:
     diverged = sum(seed.diverged for seed in curve.seeds)
     failed = curve.count(State.FAILED)
     unfinished = curve.count(State.PENDING, State.RUNNING, State.INTERRUPTED)
-    lines = [f"{curve.label}, {count} seed{'s' * (count != 1)}"]
+    lines = [f"{curve.label}, {counted(count, 'seed')}"]
     lines += [f"{diverged} diverged (×)"] * bool(diverged)
     lines += [f"{failed} failed (+)"] * bool(failed)
     lines += [f"{unfinished} unfinished"] * bool(unfinished)

@@ -18,6 +18,7 @@ from solar_cli.reporting.statistics import (
 from solar_cli.reporting.tables import Table, bounded, interval, number
 from solar_cli.store.records import State
 from solar_cli.store.store import Store
+from solar_cli.wording import counted
 
 INTERVALS = "Intervals are 95 % stratified bootstrap intervals over seeds."
 COVERS = (
@@ -182,7 +183,7 @@ def line(problem: Problem, summary: Summary) -> str:
     unit = f" {measure.unit}" if measure.unit else ""
     return (
         f"{problem.title} {summary.label}: {measure.headline} {mean_and_spread(summary)}"
-        f"{unit} after {summary.episodes} episodes, seeds: {seeds(summary)}, "
+        f"{unit} after {counted(summary.episodes, 'episode')}, seeds: {seeds(summary)}, "
         f"code: {', '.join(summary.codes) or 'unknown'}"
     )
 
