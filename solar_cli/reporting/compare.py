@@ -43,7 +43,8 @@ class Side:
     label: str
     mean: float
     """final performance"""
-    std: float
+    std: float | None
+    """over seeds; None for one"""
     episodes: int
     """where the curve ends, and its final performance is taken"""
     seeds: int
@@ -199,9 +200,7 @@ def compare_curves(problem: Problem, left: Curve, right: Curve, said: list[str])
 
 
 def _side(curve: Curve) -> Side:
-    return Side(
-        curve.label, float(curve.mean[-1]), float(curve.std[-1]), curve.end, len(curve.seeds)
-    )
+    return Side(curve.label, float(curve.mean[-1]), curve.final_std, curve.end, len(curve.seeds))
 
 
 def judge(better: float, p: float, left_seeds: int, right_seeds: int) -> tuple[Verdict, str]:

@@ -110,7 +110,8 @@ def _draw(axes: Axes, curve: Curve, colour: str, dashes: tuple[float, ...]) -> N
             held = (seed.episodes[-1], curve.end)
             axes.plot(held, [seed.penalty] * 2, ":", color=colour, linewidth=0.9, alpha=0.6)
     mean, std = curve.mean, curve.std
-    axes.fill_between(curve.grid, mean - std, mean + std, color=colour, alpha=0.18, linewidth=0)
+    if std is not None:
+        axes.fill_between(curve.grid, mean - std, mean + std, color=colour, alpha=0.18, linewidth=0)
     axes.plot(
         curve.grid,
         mean,
