@@ -151,6 +151,7 @@ SET_FAULTS = {
     "evaluation.levels=[0.5, true]": ["'evaluation.levels.1'", "a number", "True"],
     "methods.solar.update.kl_step=true": ["'methods.solar.update.kl_step'", "number", "True"],
     "methods.solar.update.linearise=1": ["'methods.solar.update.linearise'", "true or false", "1"],
+    "evaluation.milestones=[0]": ["'evaluation.milestones.0'", "greater than", "0"],
     "task=3": ["'task'"],
     "methods=3": ["methods"],
     "methods.solar=3": ["'methods.solar'"],
