@@ -71,8 +71,8 @@ def run(
 ) -> list[Result]:
     """Compute what ``plans`` ask for; one result a plan, in their order.
 
-    Ctrl-C, SIGTERM and SIGHUP stop the workers at their next pulse, where they save their state; a
-    second one ends them at once. The results are complete in both cases.
+    Ctrl-C, SIGTERM and SIGHUP stop the workers at their next pulse or step of the simulator, where
+    they save their state; a second one ends them at once. The results are complete in both cases.
     """
     work = [plan for plan in plans if plan.is_work]
     results: dict[str, Result] = {}
