@@ -196,13 +196,8 @@ def test_natural_gradient_steps_of_minibatches_average_to_the_full_step():
 def test_elbo_at_the_posterior_is_the_evidence():
     prior, (x, y) = belief(26), pairs(27, 9)
     data = mniw.regression_statistics(x, y)
-<<<<<<< HEAD
-    q = mniw.posterior(prior, data)
-    e = mniw.expected_statistics(mniw.natural(q))
-=======
     q = posterior(prior, data)
-    e = mniw.expected_statistics(q)
->>>>>>> 18d135ac8e7181b68cbe22bcf998f43d1ddad0cd
+    e = mniw.expected_statistics(mniw.natural(q))
     fit = (
         -0.5 * (e.precision * data.yy).sum()
         + (e.precision_F * data.yx).sum()
