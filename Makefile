@@ -20,7 +20,6 @@ test: install
 	$(BIN)/python -m pytest -n 2
 
 test-reliability: install
-	$(BIN)/python -m pytest tests/experiment -m quiet
 	$(BIN)/python -m pytest tests/reliability
 
 benchmark: install

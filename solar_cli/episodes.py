@@ -11,6 +11,7 @@ import hashlib
 import io
 import os
 import warnings
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +26,8 @@ from solar_cli.settings import TaskSettings
 from solar_cli.streams import Streams
 
 Floats = NDArray[np.float64]
+HELD = 8
+"""batches of frames held in memory: more than a local method at its defaults asks for in a turn"""
 
 
 class Policy(Protocol):
@@ -179,7 +182,7 @@ class Environment:
         self._streams = streams
         self._folder = folder
         self._ledger: list[dict[str, Any]] = []
-        self._kept: dict[tuple[int, int], Episodes] = {}
+        self._held: OrderedDict[tuple[int, int], Episodes] = OrderedDict()  # last asked for last
         self._call = 0
 
     @property
@@ -213,14 +216,16 @@ class Environment:
                 streams.generator("noise") if noisy else None,
             )
             found = collected.episodes
-            stored = self._store(key, noisy, collected)
-            if entry is None:
-                self._ledger.append(stored)
-            elif stored["sha256"] != entry["sha256"]:
+            data = _packed(found)
+            made = self._described(key, noisy, collected, data)
+            # Compared as files: one that another zlib has compressed counts as another, too.
+            if entry is not None and made["sha256"] != entry["sha256"]:
                 # The policy is not the one that collected them: a training has gone on since.
                 raise self._lost(entry)
-        self._kept[key] = found
-        return found
+            self._store(made["file"], data)
+            if entry is None:
+                self._ledger.append(made)
+        return self._hold(key, found)
 
     def collected(self, iteration: int) -> Episodes:
         """All episodes of one iteration."""
@@ -249,16 +254,22 @@ class Environment:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Take up a ledger; the episodes are read when they are asked for."""
         self._ledger = [dict(entry) for entry in state["ledger"]]
-        self._kept.clear()
+        self._held.clear()
 
     def _get(self, entry: Mapping[str, Any]) -> Episodes:
         key = (int(entry["iteration"]), int(entry["call"]))
-        if key not in self._kept:
-            found = self._load(entry)
-            if found is None:
-                raise self._lost(entry)
-            self._kept[key] = found
-        return self._kept[key]
+        found = self._held[key] if key in self._held else self._load(entry)
+        if found is None:
+            raise self._lost(entry)
+        return self._hold(key, found)
+
+    def _hold(self, key: tuple[int, int], episodes: Episodes) -> Episodes:
+        """Keep episodes in memory until others have been asked for since."""
+        self._held[key] = episodes
+        self._held.move_to_end(key)
+        if len(self._held) > HELD:
+            self._held.popitem(last=False)
+        return episodes
 
     def _lost(self, entry: Mapping[str, Any]) -> SolarError:
         return SolarError(
@@ -276,19 +287,26 @@ class Environment:
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             return Episodes(**dict(arrays), window=self.settings.observation.window)
 
-    def _store(self, key: tuple[int, int], noisy: bool, collected: Evaluation) -> dict[str, Any]:
-        """Write the file whole or not at all, and describe it."""
-        episodes = collected.episodes
-        buffer = io.BytesIO()
-        np.savez_compressed(
-            buffer,
-            frames=episodes.frames,
-            actions=episodes.actions,
-            action_means=episodes.action_means,
-            costs=episodes.costs,
-        )
-        data = buffer.getvalue()
-        name = f"{key[0]:04d}-{key[1]}.npz"
+    def _described(
+        self, key: tuple[int, int], noisy: bool, collected: Evaluation, data: bytes
+    ) -> dict[str, Any]:
+        """The ledger's entry of episodes whose file holds ``data``."""
+        clipped = np.abs(collected.episodes.actions) >= self.settings.action.bound
+        return {
+            "iteration": key[0],
+            "call": key[1],
+            "noisy": noisy,
+            "episodes": len(collected.episodes),
+            "file": f"{key[0]:04d}-{key[1]}.npz",
+            "sha256": hashlib.sha256(data).hexdigest(),
+            "summary": {
+                **{name: float(values.mean()) for name, values in collected.summary().items()},
+                "clipped": float(clipped.mean()),
+            },
+        }
+
+    def _store(self, name: str, data: bytes) -> None:
+        """Write the file whole or not at all."""
         self._folder.mkdir(parents=True, exist_ok=True)
         beside = self._folder / f".{name}.{os.getpid()}"
         with beside.open("wb") as file:
@@ -296,19 +314,19 @@ class Environment:
             file.flush()
             os.fsync(file.fileno())
         beside.replace(self._folder / name)
-        clipped = np.abs(episodes.actions) >= self.settings.action.bound
-        return {
-            "iteration": key[0],
-            "call": key[1],
-            "noisy": noisy,
-            "episodes": len(episodes),
-            "file": name,
-            "sha256": hashlib.sha256(data).hexdigest(),
-            "summary": {
-                **{name: float(values.mean()) for name, values in collected.summary().items()},
-                "clipped": float(clipped.mean()),
-            },
-        }
+
+
+def _packed(episodes: Episodes) -> bytes:
+    """What the file of these episodes holds; equal episodes give equal bytes."""
+    buffer = io.BytesIO()
+    np.savez_compressed(
+        buffer,
+        frames=episodes.frames,
+        actions=episodes.actions,
+        action_means=episodes.action_means,
+        costs=episodes.costs,
+    )
+    return buffer.getvalue()
 
 
 class Experience:

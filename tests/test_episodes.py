@@ -2,6 +2,7 @@
 
 import copy
 import warnings
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import pytest
 
 from solar_cli.envs import build_task
 from solar_cli.episodes import (
+    HELD,
     Environment,
     Episodes,
     Evaluation,
@@ -330,12 +332,19 @@ def test_what_was_collected_again_is_there_for_later_processes(environment: Envi
     assert_equal_bits(again(fresh, 2).recent(2)[0], collected)
 
 
-def test_collecting_again_with_another_policy_is_refused(environment: Environment):
+@damaged
+def test_collecting_again_with_another_policy_is_refused_and_changes_no_file(
+    environment: Environment, damage
+):
     environment.begin(1)
     environment.collect(Pull(), 4)
-    files(environment)[0].unlink()
-    with pytest.raises((SolarError, OSError), match=r"0001-0\.npz"):
-        again(environment, 1).collect(Pull(gain=0.9), 4)
+    damage(files(environment)[0])
+    before = {file.name: file.read_bytes() for file in files(environment)}
+    fresh = again(environment, 1)
+    with pytest.raises(SolarError, match=r"0001-0\.npz.*restore the file"):
+        fresh.collect(Pull(gain=0.9), 4)
+    assert {file.name: file.read_bytes() for file in files(environment)} == before
+    assert fresh.state_dict() == environment.state_dict()
 
 
 @damaged
@@ -351,6 +360,22 @@ def test_a_damaged_file_of_an_older_iteration_is_refused(environment: Environmen
     for ask in (lambda: fresh.recent(2), lambda: fresh.collected(1)):
         with pytest.raises((SolarError, OSError), match=r"0001-0\.npz.*damaged.*--redo"):
             ask()
+
+
+def test_frames_of_long_ago_leave_memory_and_are_read_again(environment: Environment):
+    held: list[weakref.ref[Episodes]] = []
+    starts = []
+    for iteration in range(1, HELD + 6):
+        environment.begin(iteration)
+        collected = environment.collect(Pull(), 2)
+        environment.collected(1)  # asked for every time
+        held.append(weakref.ref(collected))
+        starts.append(collected.frames[:, 0].copy())
+    del collected
+    alive = [iteration for iteration, batch in enumerate(held, 1) if batch() is not None]
+    assert alive == [1, *range(len(held) - HELD + 2, len(held) + 1)]
+    for found, start in zip(environment.recent(len(held)), starts, strict=True):
+        np.testing.assert_array_equal(found.frames[:, 0], start)
 
 
 def test_no_half_written_file_is_left(environment: Environment):

@@ -10,6 +10,7 @@ import typer
 
 from solar_cli.cli.options import AsJson, Database
 from solar_cli.cli.printing import complain, duration, print_json, print_table, say
+from solar_cli.wording import counted
 
 if TYPE_CHECKING:
     from solar_cli.cli.configuration import Line
@@ -92,7 +93,7 @@ def _print(record: CellRecord, folder: Path, headline: str, curve: list[dict[str
     code = f"{record.commit[:7]}{' with changes' if record.dirty else ''}" if record.commit else "?"
     say(f"{record.cell.title}  ({record.hash})")
     say(
-        f"{record.state.value}: iteration {record.iteration}, {record.episodes} episodes"
+        f"{record.state.value}: iteration {record.iteration}, {counted(record.episodes, 'episode')}"
         + ("" if record.target is None else f" of {record.target}")
         + f", {duration(record.seconds)} of computing, commit {code}"
     )
@@ -104,7 +105,7 @@ def _print(record: CellRecord, folder: Path, headline: str, curve: list[dict[str
     evaluation = record.cell.configuration.evaluation
     unit = f" in {evaluation.unit}" if evaluation.unit else ""
     good = f"{evaluation.better} is better"
-    say(f"{headline}{unit}, {evaluation.episodes} noise-free episodes ({good})")
+    say(f"{headline}{unit}, {counted(evaluation.episodes, 'noise-free episode')} ({good})")
     for line in plot([row["episodes"] for row in curve], [row["value"] for row in curve]):
         say(line)
     say()

@@ -7,8 +7,10 @@ notice and end, and its cells are free at once.
 
 from __future__ import annotations
 
+import math
 import signal
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -34,6 +36,9 @@ __all__ = ["Event", "Result", "default_workers", "run"]
 
 WAIT_SECONDS = 0.25
 """longest wait for news; a signal is noticed after it"""
+TOGETHER_SECONDS = 0.5
+"""in which signals are one request, the second of which would not let workers save: a closing
+terminal may send SIGHUP twice, and a launcher may forward what the terminal has sent to both"""
 CHECKPOINT_SECONDS = 60.0
 """between checkpoints inside an iteration: a run that is killed every few minutes still ends, and
 saving, some 20 ms, costs nothing"""
@@ -66,8 +71,8 @@ def run(
 ) -> list[Result]:
     """Compute what ``plans`` ask for; one result a plan, in their order.
 
-    Ctrl-C, SIGTERM and SIGHUP stop the workers at their next pulse, where they save their state; a
-    second one ends them at once. The results are complete in both cases.
+    Ctrl-C, SIGTERM and SIGHUP stop the workers at their next pulse or step of the simulator, where
+    they save their state; a second one ends them at once. The results are complete in both cases.
     """
     work = [plan for plan in plans if plan.is_work]
     results: dict[str, Result] = {}
@@ -107,6 +112,7 @@ class Scheduler:
         self._running: list[Supervision] = []
         self._results: dict[str, Result] = {}
         self._stops = 0
+        self._stopped = -math.inf
 
     def run(self, work: Sequence[Plan], workers: int) -> dict[str, Result]:
         """Work until nothing is left, or until stopped; results by hash of the cell."""
@@ -130,7 +136,11 @@ class Scheduler:
         return self._results
 
     def _stop(self) -> None:
-        self._stops += 1
+        """Count a request, of which this signal may be one of several."""
+        now = time.monotonic()
+        if now - self._stopped >= TOGETHER_SECONDS:
+            self._stopped = now
+            self._stops += 1
 
     def _obey(self) -> None:
         """Do what the signals so far ask for."""

@@ -1,7 +1,9 @@
 """One attempt at one cell, from where the last one stopped: restore, iterate, evaluate, commit.
 
 Nothing here changes what is learned. Evaluations have their own streams and simulator; checkpoints
-may fall wherever the clock says, because a learner's state is consistent at every pulse.
+may fall wherever the clock says, because a learner's state is consistent at every pulse, at every
+step of the simulator, and so whenever an attempt is asked to stop. Of what it has computed, the
+episodes that are under way then are lost, and made again by the next attempt.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ import math
 import resource
 import time
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -23,6 +26,7 @@ from solar_cli.experiment.checkpointing import Checkpoints
 from solar_cli.experiment.exhibits import exhibit
 from solar_cli.experiment.judge import Judge, measured
 from solar_cli.experiment.messages import Message
+from solar_cli.experiment.watched import WatchedTask
 from solar_cli.methods import Diverged, Learner
 from solar_cli.settings import Cell, load, method
 from solar_cli.store.records import CheckpointRecord, Metric
@@ -33,7 +37,10 @@ log = logging.getLogger(__name__)
 
 
 class Stopped(BaseException):
-    """Asked to stop, and all is saved. Not an `Exception`, so that no method can swallow it."""
+    """Asked to stop, and all is saved; the message says where it stands.
+
+    Not an `Exception`, so that no method can swallow it.
+    """
 
 
 class Supervisor(Protocol):
@@ -69,18 +76,19 @@ class Session:
         self._checkpoint_seconds = checkpoint_seconds
         self._iteration = 0
         self._inside = False  # an iteration has begun and is not committed
-        self._iterating = False  # the learner is at work, its pulses may save
+        self._learned: dict[str, float] | None = None  # metrics of an iteration yet to be judged
         self._position = 0
         self._episodes = 0  # committed with the last whole iteration
         self._headline: float | None = None
         self._evaluation: Evaluation | None = None
         self._seconds = 0.0  # of computing, in earlier attempts
         self._began = self._saved = time.monotonic()
+        self._unsaved = True  # something has come since the last checkpoint
         streams, task = Streams(cell.seed), cell.configuration.task
         self._checkpoints = Checkpoints(store, cell.hash, attempt)
-        self._judge = Judge(cell)
+        self._judge = Judge(cell, partial(self._pause, "evaluating"))
         self.environment = Environment(
-            build_task(task),
+            WatchedTask(build_task(task), self._collecting),
             task,
             streams.under("environment"),
             store.folder(cell.hash) / "episodes",
@@ -105,28 +113,28 @@ class Session:
             self._conclude({})
         while self._inside or self.environment.episodes < self._target:
             if self._supervisor.stopping:
-                raise Stopped
-            self._iterate()
+                raise Stopped(self.place)
+            if self._learned is None:
+                self._learned = self._iterate()
+            self._conclude(self._learned)
         self._exhibit()
 
-    def _iterate(self) -> None:
-        """One iteration, or the rest of one that a checkpoint was made inside of."""
+    def _iterate(self) -> dict[str, float]:
+        """One iteration, or the rest of one that a checkpoint was made inside of; its metrics."""
         if not self._inside:
             self._iteration += 1
             self._position = 0
             self._inside = True
         self.environment.begin(self._iteration)
         self._tell("starting")
-        self._iterating = True
         try:
             learned = self.learner.iterate(Experience(self.environment))
         except (np.linalg.LinAlgError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
             # What numbers that are no longer finite look like to a factorisation.
             raise Diverged(str(error)) from error
-        self._iterating = False
-        train = learned | self.environment.summary(self._iteration)
-        self._inside = False
-        self._conclude(train)
+        metrics = learned | self.environment.summary(self._iteration)
+        self._unsaved = True
+        return {name: float(value) for name, value in metrics.items()}
 
     def _conclude(self, train: dict[str, float]) -> None:
         """Evaluate; then checkpoint file, metrics and progress become durable, in this order."""
@@ -134,7 +142,6 @@ class Session:
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
         metrics.append(Metric("peak_memory_bytes", peak))
         _require_finite_return(metrics)
-        self._tell("evaluating")
         self._evaluation = self._judge.evaluate(self.learner.policy, self._iteration)
         judged = measured(self._evaluation)
         _require_finite_return(judged)
@@ -144,6 +151,7 @@ class Session:
         headline = self._cell.configuration.evaluation.headline
         self._headline = {metric.name: metric.value for metric in judged}.get(headline)
         self._episodes = self.environment.episodes
+        self._inside, self._learned = False, None
         self._commit(metrics + judged, self._save() if self._iteration > 0 else None)
         log.info("%s: %s %s", self.place, headline, self._headline)
 
@@ -164,14 +172,23 @@ class Session:
 
     def _pulse(self, activity: str, fraction: float) -> None:
         """What a learner calls every few gradient steps, where its state is consistent."""
+        self._unsaved = True
+        self._pause(activity, fraction)
+
+    def _collecting(self, fraction: float) -> None:
+        """What the simulator says at every step of episodes for the learner."""
+        self._pause("collecting", fraction)
+        self._unsaved = self._unsaved or fraction >= 1.0  # they count from now on
+
+    def _pause(self, activity: str, fraction: float) -> None:
+        """Say where it stands; save what is new when it is time to; stop when asked to."""
         self._tell(activity, fraction)
-        if not self._iterating:
-            return
         stopping = self._supervisor.stopping
-        if stopping or time.monotonic() - self._saved >= self._checkpoint_seconds:
+        due = time.monotonic() - self._saved >= self._checkpoint_seconds
+        if self._inside and self._unsaved and (stopping or due):
             self._commit([], self._save())
         if stopping:
-            raise Stopped
+            raise Stopped(self.place)
 
     def _tell(self, activity: str, fraction: float = 0.0) -> None:
         self._supervisor.tell(
@@ -185,6 +202,7 @@ class Session:
     def _save(self) -> CheckpointRecord:
         state = {
             "inside": self._inside,
+            "learned": self._learned,
             "episodes": self._episodes,
             "headline": self._headline,
             "seconds": self._computed(),
@@ -199,7 +217,7 @@ class Session:
             complete=not self._inside,
         )
         self._position += 1
-        self._saved = time.monotonic()
+        self._saved, self._unsaved = time.monotonic(), False
         return record
 
     def _commit(self, metrics: Sequence[Metric], checkpoint: CheckpointRecord | None) -> None:
@@ -229,7 +247,8 @@ class Session:
         record, state = found
         self._take_up(record, state)
         self._iteration, self._position = record.iteration, record.position + 1
-        self._inside = state["inside"]
+        self._inside, self._learned = state["inside"], state.get("learned")  # once not saved
+        self._unsaved = False
         self._episodes, self._headline = state["episodes"], state["headline"]
         self._seconds = state["seconds"]
         log.info("going on from %s: %s", record.path, self.place)

@@ -152,6 +152,8 @@ class Supervision:
         if code >= 0:
             return Outcome.FAILED, f"the worker ended with exit code {code}; its log says why"
         number = -code
+        if self._asked and number == signal.SIGTERM:
+            return Outcome.INTERRUPTED, "stopped on request while it started"
         name = signal.Signals(number).name if number in set(signal.Signals) else f"signal {number}"
         if number not in OUTSIDE:
             return Outcome.FAILED, f"the worker crashed with {name}; its log says where"

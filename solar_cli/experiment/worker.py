@@ -1,9 +1,9 @@
 """The process that computes one cell: ``python -m solar_cli.experiment.worker``.
 
 Its supervisor reads where it stands from a pipe (`messages`), and stops it with SIGTERM: it saves
-its state at the next pulse and ends. When the pipe has no reader any more, the supervisor was
-killed: the worker ends at the next pulse without writing, because the cell may have a new owner.
-Standard output and error are the cell's log.
+its state at the next pulse or step of the simulator, and ends. When the pipe has no reader any
+more, the supervisor was killed: the worker ends there without writing, because the cell may have a
+new owner. Standard output and error are the cell's log.
 """
 
 from __future__ import annotations
@@ -115,19 +115,19 @@ def compute(store: Store, options: argparse.Namespace, pipe: Pipe) -> tuple[Outc
 
         device = prepare_torch(options.device)
         cell = store.find(options.cell).cell
-        session = Session(
-            store,
-            cell,
-            options.attempt,
-            options.target,
-            pipe,
-            device=device,
-            checkpoint_seconds=options.checkpoint_seconds,
-        )
         try:
+            session = Session(
+                store,
+                cell,
+                options.attempt,
+                options.target,
+                pipe,
+                device=device,
+                checkpoint_seconds=options.checkpoint_seconds,
+            )
             session.run()
-        except Stopped:
-            return Outcome.INTERRUPTED, f"stopped on request in {session.place}"
+        except Stopped as stop:
+            return Outcome.INTERRUPTED, f"stopped on request in {stop}"
         except Diverged as error:
             traceback.print_exc()
             return Outcome.DIVERGED, f"{session.place}: {error}"

@@ -16,7 +16,6 @@ between the two forms lose half of the digits. Matrices that are not positive de
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import torch
@@ -35,7 +34,12 @@ class RegressionStatistics(NamedTuple):
     n: Float[Tensor, "*batch"]
 
     def plus(self, other: RegressionStatistics) -> RegressionStatistics:
-        """The statistics of both sets of pairs; batch axes broadcast."""
+        """The statistics of both sets of pairs; batch axes broadcast.
+
+        Natural parameters of a prior plus statistics are those of the posterior: Bayesian linear
+        regression, appendix B, with nu_t = nu' + N and V_t = (V'^-1 + sum x x^T)^-1, which it
+        misprints.
+        """
         return RegressionStatistics(*(a + b for a, b in zip(self, other, strict=True)))
 
     def scaled(self, weight: float | Float[Tensor, "*batch"]) -> RegressionStatistics:
@@ -92,13 +96,6 @@ def _joint_factor(parameters: RegressionStatistics) -> Float[Tensor, "*batch pd 
     joint = torch.cat([torch.cat([C, B.mT], -1), torch.cat([B, A], -1)], -2)
     factor: Tensor = torch.linalg.cholesky(joint)
     return factor
-
-
-def log_normaliser(q: MNIW) -> Float[Tensor, "*batch"]:
-    """log Z of the joint density of (F, S), with all constants."""
-    d, p = q.M.shape[-2:]
-    columns = (inverse_wishart.log_determinant(q.V) + p * math.log(2 * math.pi)) * (d / 2)
-    return inverse_wishart.log_normaliser(q.Psi, q.nu) + columns
 
 
 def kl_divergence(q: MNIW, p: MNIW) -> Float[Tensor, "*batch"]:
@@ -199,14 +196,6 @@ def natural_gradient_step(
     return current.scaled(1 - rate).plus(target.scaled(rate))
 
 
-def posterior(prior: MNIW, statistics: RegressionStatistics) -> MNIW:
-    """The belief after the data: Bayesian linear regression.
-
-    Appendix B, with nu_t = nu' + N and V_t = (V'^-1 + sum x x^T)^-1, which it misprints.
-    """
-    return standard(natural(prior).plus(statistics))
-
-
 def point_estimate(q: MNIW) -> tuple[Float[Tensor, "*batch d p"], Float[Tensor, "*batch d d"]]:
     """F = M and Sigma = Psi / nu of section 4.1, which is (E[S^-1])^-1 and not the mode."""
     return q.M, q.Psi / q.nu[..., None, None]
@@ -230,38 +219,6 @@ def centred(statistics: RegressionStatistics, constant: int) -> RegressionStatis
         yx[..., keep] - y_sum @ x_sum.mT / count,
         xx[..., keep, :][..., keep] - x_sum @ x_sum.mT / count,
         (n - 1).clamp(min=0),
-    )
-
-
-def log_evidence(prior: MNIW, statistics: RegressionStatistics) -> Float[Tensor, "*batch"]:
-    """log p(Y | X) of the pairs behind ``statistics`` with F and S integrated out, in nats."""
-    after, d = posterior(prior, statistics), prior.M.shape[-2]
-    constant = statistics.n * d / 2 * math.log(2 * math.pi)
-    return log_normaliser(after) - log_normaliser(prior) - constant
-
-
-def predictive_log_likelihood(
-    q: MNIW, x: Float[Tensor, "*#sample p"], y: Float[Tensor, "*#sample d"]
-) -> Float[Tensor, "*sample"]:
-    """log p(y | x) with F and S integrated out, in nats, for each sample by itself.
-
-    A multivariate Student t with nu - d + 1 degrees of freedom, location M x and scale matrix
-    Psi (1 + x^T V x) / (nu - d + 1).
-    """
-    x, y = x.double(), y.double()
-    d = q.Psi.shape[-1]
-    factor = torch.linalg.cholesky(q.Psi)
-    residual = y - torch.einsum("...ij,...j->...i", q.M, x)
-    squared = (
-        torch.einsum("...ij,...j->...i", cholesky.inverse_factor(factor), residual).square().sum(-1)
-    )
-    inflation = 1 + _form(q.V, x, x)
-    log_det = cholesky.log_determinant(factor) + d * inflation.log()
-    return (
-        torch.lgamma((q.nu + 1) / 2)
-        - torch.lgamma((q.nu - d + 1) / 2)
-        - 0.5 * (d * math.log(math.pi) + log_det)
-        - (q.nu + 1) / 2 * torch.log1p(squared / inflation)
     )
 
 

@@ -42,11 +42,6 @@ def standard(parameters: RegressionStatistics) -> NIW:
     return NIW(q.Psi, q.nu, q.M[..., 0], 1 / q.V[..., 0, 0])
 
 
-def log_normaliser(q: NIW) -> Float[Tensor, "*batch"]:
-    """log Z of the joint density of (mu, Sigma), with all constants."""
-    return mniw.log_normaliser(_as_regression(q))
-
-
 def kl_divergence(q: NIW, p: NIW) -> Float[Tensor, "*batch"]:
     """KL(q || p) in nats."""
     return mniw.kl_divergence(_as_regression(q), _as_regression(p))
@@ -74,16 +69,6 @@ def expected_initial_kl(
     """
     expected = mniw.expected_statistics(parameters)
     return mniw.expected_transition_kl(expected, starts, log_variance)
-
-
-def posterior(prior: NIW, statistics: RegressionStatistics) -> NIW:
-    """The belief after the initial states behind ``statistics``."""
-    return standard(natural(prior).plus(statistics))
-
-
-def point_estimate(q: NIW) -> tuple[Float[Tensor, "*batch d"], Float[Tensor, "*batch d d"]]:
-    """mu0 and Psi / nu, as for the dynamics (section 4.1)."""
-    return q.mu0, q.Psi / q.nu[..., None, None]
 
 
 def _as_regression(q: NIW) -> MNIW:

@@ -31,9 +31,9 @@ class Learner(Protocol):
     def iterate(self, experience: Experience) -> dict[str, float]:
         """One iteration: collect, learn; the metrics of what happened. Raises `Diverged`.
 
-        Restored from a state that was saved at a pulse inside an iteration, the next call does that
-        iteration again, with the same bits: what it collected is on disk, and long training goes on
-        where it stood.
+        Restored from a state that was saved inside an iteration, at a pulse or while it collects,
+        the next call does that iteration again, with the same bits: what it collected is on disk,
+        and long training goes on where it stood.
         """
 
     def state_dict(self) -> dict[str, Any]:

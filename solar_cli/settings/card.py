@@ -17,7 +17,7 @@ from pydantic import BaseModel, ValidationError
 
 from solar_cli.errors import UsageError, nearest
 from solar_cli.settings.registry import method, method_names, settings_class
-from solar_cli.settings.schema import Settings, setting
+from solar_cli.settings.schema import Settings, converted, setting
 from solar_cli.settings.task import EvaluationSettings, TaskSettings
 
 PACKAGED = Path(__file__).parent.parent / "_tasks"
@@ -296,7 +296,7 @@ def _leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterable[str]:
 def _validated(model: type[S], table: Any, where: str, path: str = "") -> S:
     """Validate, or say every mistake in one line: where, which key, what was expected."""
     try:
-        return model.model_validate(table)
+        made = model.model_validate(table)
     except ValidationError as error:
         mistakes = []
         for fault in error.errors(include_url=False):
@@ -308,6 +308,13 @@ def _validated(model: type[S], table: Any, where: str, path: str = "") -> S:
                 given = "" if fault["type"] == "missing" else f", not {fault['input']!r}"
                 mistakes.append(f"{key!r}: {fault['msg']}{given}")
         raise UsageError(f"{where}: {'; '.join(mistakes)}") from error
+    mistakes = [
+        f"{key!r}: Input should be {expected}, not {given!r}"
+        for key, expected, given in converted(table, made, path)
+    ]
+    if mistakes:
+        raise UsageError(f"{where}: {'; '.join(mistakes)}")
+    return made
 
 
 def _siblings(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:

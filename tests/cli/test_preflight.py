@@ -27,6 +27,31 @@ def test_a_task_that_does_not_hold_is_refused(
     assert stored.db.read_bytes() == before
 
 
+@pytest.mark.parametrize("dry", [(), ("--dry-run",)])
+@pytest.mark.parametrize(
+    ("change", "largest"),
+    [
+        ("methods.solar.representation.latent=100000", "methods.solar.representation.latent"),
+        ("task.horizon=1000000", "task.horizon"),
+        ("evaluation.episodes=1000000", "evaluation.episodes"),
+        ("methods.solar.batches.initial=1000000", "methods.solar.batches"),
+    ],
+)
+def test_what_cannot_fit_into_the_machine_is_refused_before_it_starts(
+    solar: Solar,
+    stored: Stored,
+    monkeypatch: pytest.MonkeyPatch,
+    dry: tuple[str, ...],
+    change: str,
+    largest: str,
+) -> None:
+    monkeypatch.setattr("solar_cli.experiment.provenance.memory_bytes", lambda field: 10 * 2**30)
+    before = stored.db.read_bytes()
+    done = solar(*RUN, "--set", change, *dry, "--db", stored.db)
+    done.refused("nav/solar: takes at least", "this machine has 10.0 GiB", "lower", largest)
+    assert stored.db.read_bytes() == before
+
+
 @pytest.mark.parametrize("headline", ["return", "final_distance", "mean_distance"])
 def test_every_measure_can_be_the_headline(solar: Solar, stored: Stored, headline: str) -> None:
     change = f'evaluation.headline="{headline}"'

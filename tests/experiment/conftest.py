@@ -1,5 +1,6 @@
 """The fake method, registered as any other package's would be; cells and attempts of it."""
 
+import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,14 @@ def fake_package(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         registry._known.cache_clear()
         yield
     registry._known.cache_clear()
+
+
+@pytest.fixture(autouse=True)
+def interruptible() -> Iterator[None]:
+    """Ctrl-C is heard, though a shell that starts the tests in the background has it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture

@@ -29,11 +29,11 @@ class FakeSettings(Settings):
     budget: Budget = setting(Budget(desk=12, full=16), "where to stop", presentation=True)
     batch: int = setting(4, "episodes an iteration")
     steps: int = setting(3, "pulses an iteration")
-    nap: float = setting(0.0, "seconds of sleep a step")
+    hold: str = setting("", "a file that keeps an iteration from going on")
     trouble: Literal["none", "raise", "diverge", "nan", "factorise", "segfault"] = setting(
         "none", "what goes wrong"
     )
-    at: int = setting(2, "iteration in which it goes wrong")
+    at: int = setting(2, "iteration in which it goes wrong, or holds")
 
 
 def features(observations: NDArray[Any]) -> NDArray[np.float64]:
@@ -85,10 +85,16 @@ class Fake:
             self.momentum = 0.9 * self.momentum + cost * push
             self.weights = self.weights + 0.01 * self.momentum
             self.step += 1
-            time.sleep(self.settings.nap)
             self.pulse("walking", self.step / self.settings.steps)
+            self._hold(environment.iteration)
         self.step = 0
         return {"norm": float(self.weights.norm()), "seconds_walking": time.perf_counter()}
+
+    def _hold(self, iteration: int) -> None:
+        held = self.settings.hold and iteration == self.settings.at
+        while held and os.path.exists(self.settings.hold):
+            time.sleep(0.02)
+            self.pulse("held", self.step / self.settings.steps)
 
     def _fail(self, iteration: int) -> None:
         if iteration != self.settings.at or self.step < 1:

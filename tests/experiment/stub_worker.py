@@ -9,6 +9,8 @@ from typing import Any
 
 ARGUMENTS = dict(zip(sys.argv[1::2], sys.argv[2::2], strict=True))
 CELL, ATTEMPT, TARGET = (ARGUMENTS[f"--{name}"] for name in ("cell", "attempt", "target"))
+MINUTES = 200.0
+"""longer than any machine is busy: a test that waits for this has failed"""
 stopping = False
 
 
@@ -57,7 +59,8 @@ def lose_the_cell() -> None:
     with store() as opened:
         opened.end(CELL, int(ATTEMPT), Outcome.INTERRUPTED)
         opened.claim(CELL, Owner.of(os.getppid()), int(TARGET), {})
-    work(60)
+    work(MINUTES)
+    print("unharmed", flush=True)
 
 
 signal.signal(signal.SIGTERM, stop)
@@ -71,9 +74,14 @@ match what:
         sys.exit(int(detail))
     case "signal":
         os.kill(os.getpid(), signal.Signals[detail])
-        time.sleep(60)
+        time.sleep(MINUTES)
+    case "early":
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        say("importing", 0.0)
+        time.sleep(MINUTES)
     case "deaf":
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
-        time.sleep(60)
+        say("deaf", 0.0)
+        time.sleep(MINUTES)
     case "lose":
         lose_the_cell()

@@ -1,6 +1,8 @@
 """One attempt at one cell: whatever interrupts it, the results are those of a quiet run."""
 
 from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,7 @@ from solar_cli.experiment.judge import Judge
 from solar_cli.experiment.messages import Message
 from solar_cli.experiment.session import Session, Stopped
 from solar_cli.methods import Diverged
-from solar_cli.settings import Cell
+from solar_cli.settings import Cell, cells, load_card
 from solar_cli.store.owner import Owner
 from solar_cli.store.records import Fenced, Outcome
 from solar_cli.store.store import Store
@@ -30,18 +32,24 @@ class Killed(BaseException):
 
 
 class Boss:
-    """A supervisor that stops or kills at the n-th thing it hears."""
+    """A supervisor that stops or kills at the n-th thing it hears, or hears of an activity."""
 
-    def __init__(self, stop_at: int | None = None, kill_at: int | None = None) -> None:
-        self.stop_at, self.kill_at = stop_at, kill_at
+    def __init__(
+        self, stop_at: int | None = None, kill_at: int | None = None, activity: str = ""
+    ) -> None:
+        self.stop_at, self.kill_at, self.activity = stop_at, kill_at, activity
         self.heard: list[Message] = []
         self.stopping = False
 
     def tell(self, message: Message) -> None:
         self.heard.append(message)
-        if len(self.heard) == self.kill_at:
+        heard = len(self.of(self.activity))
+        if heard == self.kill_at:
             raise Killed
-        self.stopping = self.stopping or len(self.heard) == self.stop_at
+        self.stopping = self.stopping or heard == self.stop_at
+
+    def of(self, activity: str) -> list[Message]:
+        return [m for m in self.heard if activity in ("", m.activity)]
 
 
 def attempt(
@@ -106,11 +114,11 @@ def test_each_iteration_has_metrics_of_learning_evaluation_and_model(
 def test_a_kill_at_any_moment_changes_no_bit(
     store: Store, cell: Cell, quiet: Callable[[Cell], dict[str, str]]
 ) -> None:
-    # Every message is a moment to die at: pulses, evaluations, before commits, before pictures.
+    # Every message is a moment to die at: pulses, steps of a simulator, before commits.
     moments = set()
     kills = 0
     while True:
-        boss = Boss(kill_at=2 + kills % 6)
+        boss = Boss(kill_at=2 + 2 * kills)  # later every time, or it would never get on
         try:
             attempt(store, cell, boss)
             break
@@ -118,7 +126,7 @@ def test_a_kill_at_any_moment_changes_no_bit(
             kills += 1
             moments.add(boss.heard[-1].activity)
     assert kills >= 10
-    assert moments >= {"starting", "walking", "evaluating", "saving"}
+    assert moments >= {"collecting", "walking", "evaluating", "saving"}
     assert fingerprint(store, cell.hash) == quiet(cell)
 
 
@@ -167,16 +175,62 @@ def test_a_kill_around_a_commit_changes_no_bit(
 def test_a_stop_saves_where_it_stands_and_the_next_attempt_goes_on_there(
     store: Store, cell: Cell, quiet: Callable[[Cell], dict[str, str]]
 ) -> None:
-    boss = Boss(stop_at=10)
+    boss = Boss(stop_at=4, activity="walking")
     with pytest.raises(Stopped):
         attempt(store, cell, boss, every=1e9)
     newest = store.checkpoints(cell.hash)[0]
     assert (newest.iteration, newest.complete) == (2, False)
     later = Boss()
     attempt(store, cell, later, every=1e9)
-    pulses = [m for boss in (boss, later) for m in boss.heard if m.activity == "walking"]
+    pulses = boss.of("walking") + later.of("walking")
     assert len(pulses) == 9  # three iterations of three steps: none was done twice
     assert fingerprint(store, cell.hash) == quiet(cell)
+
+
+STEPS = 11  # messages of episodes that run from their reset to the tenth action
+
+
+@pytest.mark.parametrize("activity", ["collecting", "evaluating"])
+@pytest.mark.parametrize("step", range(1, 3 * STEPS + 1, 5))
+def test_a_stop_among_episodes_takes_one_step_and_costs_no_others(
+    store: Store, cell: Cell, quiet: Callable[[Cell], dict[str, str]], activity: str, step: int
+) -> None:
+    boss = Boss(stop_at=step, activity=activity)
+    with pytest.raises(Stopped):
+        attempt(store, cell, boss, every=1e9)
+    assert len(boss.of(activity)) == step
+    later = Boss()
+    attempt(store, cell, later, every=1e9)
+    again = (step - 1) % STEPS + 1
+    for made in ("collecting", "evaluating", "walking"):
+        once = {"collecting": 3 * STEPS, "evaluating": 4 * STEPS, "walking": 9}[made]
+        assert len(boss.of(made) + later.of(made)) == once + (again if made == activity else 0)
+    assert fingerprint(store, cell.hash) == quiet(cell)
+
+
+def test_a_kill_late_in_a_long_evaluation_costs_the_evaluation_only(
+    store: Store, cell: Cell, quiet: Callable[[Cell], dict[str, str]]
+) -> None:
+    boss = Boss(kill_at=3 * STEPS, activity="evaluating")  # of iteration 2
+    with pytest.raises(Killed):
+        attempt(store, cell, boss, every=0.0)
+    later = Boss()
+    attempt(store, cell, later, every=0.0)
+    assert later.heard[1].activity == "evaluating"  # the first after "restoring"
+    assert len(boss.of("walking") + later.of("walking")) == 9
+    assert fingerprint(store, cell.hash) == quiet(cell)
+
+
+def test_a_stop_before_anything_was_collected_leaves_the_last_iteration_complete(
+    store: Store, cell: Cell
+) -> None:
+    attempt(store, cell, target=4)
+    with pytest.raises(Stopped):
+        attempt(store, cell, Boss(stop_at=5, activity="collecting"), every=0.0)
+    assert store.checkpoints(cell.hash)[0].complete
+    later = Boss()
+    attempt(store, cell, later, target=4)
+    assert not later.of("collecting")
 
 
 def test_more_episodes_continue_a_finished_cell(
@@ -192,7 +246,7 @@ def test_a_finished_cell_is_not_computed_again(store: Store, cell: Cell) -> None
     before = fingerprint(store, cell.hash)
     boss = Boss()
     attempt(store, cell, boss)
-    assert not [m for m in boss.heard if m.activity in ("walking", "evaluating", "saving")]
+    assert not boss.of("collecting") + boss.of("walking") + boss.of("saving")
     assert fingerprint(store, cell.hash) == before
 
 
@@ -251,8 +305,9 @@ def test_a_cell_without_a_sound_checkpoint_starts_anew_and_says_so(
 def test_episode_files_that_are_lost_after_a_kill_are_collected_again(
     store: Store, cell: Cell, quiet: Callable[[Cell], dict[str, str]]
 ) -> None:
+    boss = Boss(kill_at=1, activity="walking")  # collected, not yet in a checkpoint
     with pytest.raises(Killed):
-        attempt(store, cell, Boss(kill_at=5), every=1e9)  # collected, not yet in a checkpoint
+        attempt(store, cell, boss, every=1e9)
     for path in (store.folder(cell.hash) / "episodes").iterdir():
         flip(path)
     attempt(store, cell)
@@ -272,18 +327,39 @@ def test_a_checkpoint_that_does_not_fit_the_code_says_what_to_do(
         attempt(store, cell)
 
 
+@pytest.mark.parametrize(("every", "kept"), [(1e9, [8, 7, 3]), (0.0, [8, 8, 3])])
 def test_two_newest_checkpoints_and_the_best_by_training_cost_are_kept(
-    store: Store, cell: Cell, monkeypatch: pytest.MonkeyPatch
+    store: Store, cell: Cell, monkeypatch: pytest.MonkeyPatch, every: float, kept: list[int]
 ) -> None:
     def best_at_four(self: Environment, iteration: int) -> dict[str, float]:
         return {"return": -abs(iteration - 4.0)}
 
     monkeypatch.setattr(Environment, "summary", best_at_four)
-    attempt(store, cell, target=32, every=1e9)
+    attempt(store, cell, target=32, every=every)
     # Iteration 4 is collected by the policy of the checkpoint of iteration 3.
     records = store.checkpoints(cell.hash)
-    assert [record.iteration for record in records] == [8, 7, 3]
+    assert [record.iteration for record in records] == kept
     assert files_of(store, cell.hash) == {store.folder(cell.hash) / r.path for r in records}
+
+
+def test_the_first_checkpoint_at_each_milestone_of_the_card_is_kept(
+    store: Store, cell: Cell
+) -> None:
+    card = load_card("nav")
+    tables = {**card.tables["evaluation"], "milestones": [4, 10, 18, 1000]}
+    marked = replace(card, tables={**card.tables, "evaluation": tables})
+    [kept] = cells(marked, "fake", [0], "smoke")
+    assert kept.hash == cell.hash  # milestones name no other cell
+    for _ in range(9):  # killed within every iteration, saved at every pulse
+        with suppress(Killed):
+            attempt(store, kept, Boss(kill_at=9), target=32)
+    attempt(store, kept, target=32)
+    best = checkpointing.best_iteration(store, kept.hash)
+    records = store.checkpoints(kept.hash)
+    # Four episodes an iteration: 4 are reached in iteration 1, 10 in 3, 18 in 5, 1000 not yet.
+    assert {r.iteration for r in records if r.complete} == {1, 3, 5, 8} | {best}
+    assert [record.episodes for record in records if record.iteration in (1, 3, 5)] == [20, 12, 4]
+    assert files_of(store, kept.hash) == {store.folder(kept.hash) / r.path for r in records}
 
 
 def test_evaluation_episodes_are_none_that_were_learned_from(store: Store, cell: Cell) -> None:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from argparse import Namespace
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 from sqlalchemy.exc import OperationalError
@@ -216,23 +217,24 @@ def test_workers_of_their_own_process_end_as_they_say(store: Store, make_cells: 
     assert {"commit", "dirty", "packages", "hardware", "command"} <= set(provenance)
 
 
-@pytest.mark.quiet
 def test_a_stopped_worker_saves_and_the_next_run_goes_on(
-    store: Store, make_cells: MakeCells
+    store: Store, make_cells: MakeCells, tmp_path: Path
 ) -> None:
-    [cell] = make_cells(nap=0.3)  # 9 steps: long enough to be stopped in the middle
-    stops: list[Event] = []
+    hold = tmp_path / "hold"
+    hold.touch()
+    [cell] = make_cells(hold=str(hold))
+    held: list[Event] = []
 
     def stop(event: Event) -> None:
-        message = event.message
-        if message and message.activity == "walking" and message.iteration == 2:
-            stops.append(event)
-            if len(stops) == 1:  # a second one would end the worker at once
+        if event.message and event.message.activity == "held":
+            held.append(event)
+            if len(held) == 1:
                 os.kill(os.getpid(), signal.SIGINT)
 
     [result] = run(plan(store, [cell]), store, report=stop)
     assert result.outcome is Outcome.INTERRUPTED
     assert "stopped on request in iteration 2" in result.cause
     assert not store.checkpoints(cell.hash)[0].complete
+    hold.unlink()
     [result] = run(plan(store, [cell]), store)
     assert result.finished

@@ -1,9 +1,10 @@
-"""An iteration that was interrupted at any pulse ends with the bits of one that was not."""
+"""An iteration that was interrupted where it may be ends with the bits of one that was not."""
 
 import pytest
 from method_runs import Run
 
 from solar_cli.errors import SolarError
+from solar_cli.experiment.watched import WatchedTask
 
 FINE_TUNING = ("training.fine_tune_steps=8", "training.fine_tune_rate=0.003")
 FLOORS = ("update.early_updates=1", "update.std_floor=[0.95, 0.3]", "update.kl_step=5.0")
@@ -30,6 +31,25 @@ def test_a_run_interrupted_at_any_pulse_ends_with_the_same_bits(tmp_path, name, 
     )
     whole.iterate(1, last)
     assert len(saved) == pulses
+    for iteration, state in saved:
+        resumed = Run(tmp_path, name, *sets).restore(state).iterate(iteration, last)
+        assert repr(resumed.metrics) == repr(whole.metrics[iteration - 1 :])
+        assert resumed.bits() == whole.bits()
+
+
+@pytest.mark.parametrize("name", ["solar", "vae"])
+@pytest.mark.parametrize("noise_free", [0, 2])
+def test_a_run_interrupted_while_it_collects_ends_with_the_same_bits(tmp_path, name, noise_free):
+    sets = (*FINE_TUNING, f"batches.noise_free={noise_free}")
+    last, saved = 3, []
+
+    def halfway(share):
+        if share == 0.5:
+            saved.append((whole.environment.iteration, whole.state()))
+
+    whole = Run(tmp_path, name, *sets, wrap=lambda task: WatchedTask(task, halfway))
+    whole.iterate(1, last)
+    assert [iteration for iteration, _ in saved] == sorted([1, 2, 3] * (1 + bool(noise_free)))
     for iteration, state in saved:
         resumed = Run(tmp_path, name, *sets).restore(state).iterate(iteration, last)
         assert repr(resumed.metrics) == repr(whole.metrics[iteration - 1 :])

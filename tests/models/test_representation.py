@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from model_problems import digest, through_a_file, vector_episodes, vector_task
+from bits import digest, through_a_file
+from model_problems import vector_episodes, vector_task
 
 from solar_cli.episodes import Episodes, window_indices
 from solar_cli.errors import UsageError
@@ -239,19 +240,10 @@ def checkpoints(batches: list[Collected], **changes) -> tuple[list[Any], str, li
     metrics: list[dict[str, float]] = []
     for batch in batches:
         metrics.append(model.update(batch))
-    return saved, timeless(model.state_dict()), metrics
+    return saved, digest(model.state_dict()), metrics
 
 
 SCORES = (0.1, 0.2, 0.9)
-
-
-def timeless(state: Any) -> str:
-    """The digest of a state without the seconds that were spent on it."""
-    if isinstance(state, dict):
-        return digest(
-            {name: timeless(part) for name, part in state.items() if "seconds" not in str(name)}
-        )
-    return digest([timeless(part) for part in state] if isinstance(state, list | tuple) else state)
 
 
 def without_seconds(metrics: dict[str, float]) -> dict[str, float]:
@@ -280,7 +272,7 @@ def test_an_update_stopped_at_any_pulse_goes_on_with_the_same_bits(
         resumed.load_state_dict(state)
         for batch, before in list(zip(batches, metrics, strict=True))[number:]:
             assert without_seconds(resumed.update(batch)) == without_seconds(before)
-        assert timeless(resumed.state_dict()) == expected
+        assert digest(resumed.state_dict()) == expected
 
 
 @pytest.mark.parametrize("fine_tune_steps", [0, 4])

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from model_problems import digest, through_a_file, vector_episodes, vector_task
+from bits import digest, through_a_file
+from model_problems import vector_episodes, vector_task
 
 from solar_cli.episodes import Episodes
 from solar_cli.methods import Diverged

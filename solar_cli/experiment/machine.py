@@ -1,4 +1,4 @@
-"""What ``solar doctor`` looks at: each check says what it found and, where bad, what to do."""
+"""Whether this machine has what a run needs: each check says what it found, and what to do."""
 
 from __future__ import annotations
 
@@ -14,6 +14,10 @@ from importlib.metadata import version
 from pathlib import Path
 
 from solar_cli.errors import SolarError, UsageError
+from solar_cli.experiment.provenance import cores, package_versions
+from solar_cli.store.address import locate
+from solar_cli.store.database import file_system
+from solar_cli.store.store import Store
 
 LEAST_FREE = 2 * 2**30
 """Bytes of free disk from which there is a warning: some ten cells at their largest."""
@@ -50,8 +54,6 @@ def checks(address: str | None) -> Iterator[Check]:
 
 def packages() -> Iterator[Check]:
     """Versions of Solar and of what it stands on."""
-    from solar_cli.experiment.provenance import package_versions
-
     yield Check("Solar", version("solar-cli"))
     found = package_versions()
     yield Check("packages", ", ".join(f"{name} {number}" for name, number in found.items()))
@@ -59,8 +61,6 @@ def packages() -> Iterator[Check]:
 
 def torch_build() -> Check:
     """The devices that torch sees, and its threads."""
-    from solar_cli.experiment.provenance import cores
-
     try:
         import torch
     except Exception as error:  # a broken build fails in many ways, and none may hide the rest
@@ -74,9 +74,6 @@ def torch_build() -> Check:
 
 def store(address: str | None) -> Iterator[Check]:
     """The database, and the folder of the cells' files."""
-    from solar_cli.store.address import locate
-    from solar_cli.store.store import Store
-
     try:
         location = locate(address)
         if isinstance(location.place, Path) and not location.place.exists():
@@ -102,8 +99,6 @@ def judged(name: str, found: str) -> Check:
 
 def folder(home: Path) -> Iterator[Check]:
     """Permission, file system and space where ``home`` is, or will be."""
-    from solar_cli.store.database import file_system
-
     there = next(path for path in (home, *home.absolute().parents) if path.is_dir())
     try:
         with tempfile.TemporaryFile(dir=there):
