@@ -31,11 +31,20 @@ START = (1.5, -1.5, math.pi / 2.0)
 START_STD = 0.1
 """standard deviation of each of the three"""
 TARGET = (-2.0, 2.0)
+"""as in the authors' release"""
 
 VIEW = 8.0 / 3.0
 """an image shows +-2.667: at 64 pixels a world unit is 12 pixels, as in the authors' release"""
-GREYS = {"wheels": 128.0, "body": 255.0, "windscreen": 0.0, "target": 255.0}
-"""on black (ours)"""
+CAR = (
+    # Two axles as wide as their wheels, of which the body leaves the ends; then the windscreen.
+    Box((-0.36, 0.0), (0.16, 0.38), 128.0),
+    Box((0.36, 0.0), (0.16, 0.38), 128.0),
+    Box((0.0, 0.0), (0.6, 0.3), 255.0),
+    Box((0.2, 0.0), (0.12, 0.24), 0.0),
+)
+"""in world units, on black; the body is the release's, 1.2 by 0.6, all else ours"""
+MARK = (Disc((0.0, 0.0), 0.107, 255.0),)
+"""of the target, in world units; its radius is the release's"""
 AGENT_INK, TARGET_INK = (0.85, 0.8, 0.75), (0.9, 0.55, 0.1)
 """red, green and blue that a picture's car and target take away from its paper: dark, and blue"""
 PICTURE = 64
@@ -93,20 +102,14 @@ class CarFromImages(Car):
         self.size = size
         unit = size / (2.0 * VIEW)
         self._pixels_per_unit = unit
-        self._car = (
-            # Two axles as wide as their wheels, which show beside the body that covers the rest.
-            Box((-0.36 * unit, 0.0), (0.16 * unit, 0.38 * unit), GREYS["wheels"]),
-            Box((0.36 * unit, 0.0), (0.16 * unit, 0.38 * unit), GREYS["wheels"]),
-            Box((0.0, 0.0), (0.6 * unit, 0.3 * unit), GREYS["body"]),
-            Box((0.2 * unit, 0.0), (0.12 * unit, 0.24 * unit), GREYS["windscreen"]),
-        )
-        self._target = (Disc((0.0, 0.0), 0.107 * unit, GREYS["target"]),)
+        self._car = [part.scaled(unit) for part in CAR]
+        self._mark = [part.scaled(unit) for part in MARK]
 
     def scenes(self, rows: Floats) -> Frames:
         """The target."""
         frames = np.zeros((len(rows), 1, self.size, self.size), np.uint8)
         targets = self._places(np.tile(TARGET, (len(rows), 1)))
-        draw_figure(frames[:, 0], targets, np.zeros(len(rows)), self._target)
+        draw_figure(frames[:, 0], targets, np.zeros(len(rows)), self._mark)
         return frames
 
     def draw(self, rows: Floats, scenes: Frames) -> Frames:

@@ -20,7 +20,7 @@ CHUNK_PIXELS = 15_000
 """pixels of figures drawn at once: temporaries below 128 KiB, which malloc keeps in its heap"""
 
 
-def draw_blobs(images: NDArray[np.uint8], centres: NDArray[np.float64], deviation: float) -> None:
+def draw_blobs(images: NDArray[np.uint8], centres: Floats, deviation: float) -> None:
     """Draw a Gaussian blob into each black image (N, H, W), in place.
 
     ``centres`` (N, 2) are (row, column) in pixels, ``deviation`` is the blob's standard deviation
@@ -36,9 +36,7 @@ def draw_blobs(images: NDArray[np.uint8], centres: NDArray[np.float64], deviatio
     windows[np.arange(len(images)), top, left] = patches
 
 
-def _profiles(
-    centres: NDArray[np.float64], pixels: int, deviation: float
-) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+def _profiles(centres: Floats, pixels: int, deviation: float) -> tuple[NDArray[np.intp], Floats]:
     """Bell curves along an axis of ``pixels``: first pixel (N,), values (N, size) from there on.
 
     Pixels that are left out would round to zero, or lie outside the image.
@@ -52,7 +50,7 @@ def _profiles(
 
 
 class Box(NamedTuple):
-    """A filled rectangle of a figure; lengths in pixels."""
+    """A filled rectangle of a figure; lengths in pixels when it is drawn."""
 
     centre: tuple[float, float]
     """ahead of the figure's centre, and to its left"""
@@ -67,6 +65,11 @@ class Box(NamedTuple):
         sides = zip(self.centre, self.half, strict=True)
         return math.hypot(*(abs(centre) + half + 0.5 for centre, half in sides))
 
+    def scaled(self, factor: float) -> Box:
+        """The same with every length times ``factor``."""
+        (ahead, left), (long, wide) = self.centre, self.half
+        return Box((factor * ahead, factor * left), (factor * long, factor * wide), self.grey)
+
     def coverage(self, ahead: Floats, left: Floats) -> Floats:
         """Share of each pixel that it covers: exact where its sides follow the pixels."""
         return _overlap(ahead - self.centre[0], self.half[0]) * _overlap(
@@ -75,7 +78,7 @@ class Box(NamedTuple):
 
 
 class Disc(NamedTuple):
-    """A filled circle of a figure; lengths in pixels."""
+    """A filled circle of a figure; lengths in pixels when it is drawn."""
 
     centre: tuple[float, float]
     """ahead of the figure's centre, and to its left"""
@@ -87,6 +90,11 @@ class Disc(NamedTuple):
     def reach(self) -> float:
         """No pixel farther than this from the figure's centre shows it."""
         return math.hypot(*self.centre) + self.radius + 0.5
+
+    def scaled(self, factor: float) -> Disc:
+        """The same with every length times ``factor``."""
+        ahead, left = self.centre
+        return Disc((factor * ahead, factor * left), factor * self.radius, self.grey)
 
     def coverage(self, ahead: Floats, left: Floats) -> Floats:
         """Share of each pixel that it covers, from the distance to its edge."""
@@ -155,7 +163,7 @@ def _overlap(places: Floats, half: float) -> Floats:
     return np.minimum(np.maximum(half + 0.5 - np.abs(places), 0.0), min(1.0, 2.0 * half))
 
 
-def enlarge(images: NDArray[np.float64], factor: int) -> NDArray[np.float64]:
+def enlarge(images: Floats, factor: int) -> Floats:
     """Images (..., H, W) at ``factor`` times the resolution, (..., H factor, W factor).
 
     Smooth cubic interpolation through the pixel centres (Catmull-Rom), for people to look at: it
@@ -165,7 +173,7 @@ def enlarge(images: NDArray[np.float64], factor: int) -> NDArray[np.float64]:
     return np.asarray(rows @ images @ columns.T)
 
 
-def _interpolation(size: int, factor: int) -> NDArray[np.float64]:
+def _interpolation(size: int, factor: int) -> Floats:
     """(size factor, size) weights of cubic interpolation; each row sums to one."""
     places = np.clip((np.arange(size * factor) + 0.5) / factor - 0.5, 0, size - 1)
     d = np.abs(places[:, None] - np.arange(size))

@@ -11,6 +11,7 @@ import torch
 from model_problems import made_up_segments, vector_task
 from scipy import special, stats
 
+from solar_cli.inference import niw
 from solar_cli.models.priors import (
     LinearDynamics,
     Segments,
@@ -394,6 +395,22 @@ def test_before_any_data_the_factors_are_the_prior():
     prior.conclude(whole_episodes(1))
     assert prior.metrics()["kl_dynamics"] > 1.0
     assert prior.metrics()["kl_initial"] > 0.1
+
+
+@every_form
+def test_a_latent_that_never_changes_breaks_neither_factor(factors, rows, window):
+    segments = whole_episodes(1, count=40)
+    segments.mean[..., 1] = 3.0
+    segments.variance[..., 1] = 1e-7
+    segments.mean.requires_grad_()
+    prior = dynamics(factors, rows, window)
+    prior.conclude(segments)
+    kl = prior.kl(segments)
+    (gradient,) = torch.autograd.grad(kl, segments.mean)
+    assert torch.isfinite(gradient).all()
+    assert all(math.isfinite(value) for value in (kl.item(), *prior.metrics().values()))
+    # Its start is known: the prior's one sample at 0 counts beside the 40 at 3.
+    assert float(niw.standard(prior.initial).mu0[1]) == pytest.approx(3.0 * 40 / 41)
 
 
 # The VAE's
