@@ -35,14 +35,39 @@ class _Quadratic(NamedTuple):
         diagonal = torch.diagonal(self.L, dim1=-2, dim2=-1)
         return self.L.tril(-1) + torch.diag_embed(torch.nn.functional.softplus(diagonal))
 
+    def coefficients(self) -> Float[Tensor, "*k q"]:
+        """Weights of `_monomials`."""
+        cholesky = self.cholesky()
+        C = cholesky @ cholesky.mT
+        pairs = torch.tril_indices(*C.shape[-2:])
+        halves = torch.where(pairs[0] == pairs[1], 0.5, 1.0).to(C)
+        return torch.cat([halves * C[..., *pairs], self.c, self.b.unsqueeze(-1)], dim=-1)
+
     def value(self, z: Float[Tensor, "*k n m"]) -> Float[Tensor, "*k n"]:
         """The quadratic form at every sample."""
-        half = z @ self.cholesky()
-        return (
-            0.5 * half.square().sum(dim=-1)
-            + (z @ self.c.unsqueeze(-1)).squeeze(-1)
-            + self.b.unsqueeze(-1)
+        return (_monomials(z) @ self.coefficients().unsqueeze(-1)).squeeze(-1)
+
+
+def _monomials(z: Float[Tensor, "*k n m"]) -> Float[Tensor, "*k n q"]:
+    """[z_i z_j for j <= i; z; 1]: a quadratic is linear in them."""
+    i, j = torch.tril_indices(z.shape[-1], z.shape[-1])
+    return torch.cat([z[..., i] * z[..., j], z, torch.ones_like(z[..., :1])], dim=-1)
+
+
+class _Moments(NamedTuple):
+    """Means over the samples of one or several fits: all that a squared error needs of them."""
+
+    xx: Float[Tensor, "*k q q"]
+    xy: Float[Tensor, "*k q"]
+    yy: Float[Tensor, "*k"]
+
+    def error(self, quadratic: _Quadratic) -> Float[Tensor, "*k"]:
+        """Mean squared error."""
+        w = quadratic.coefficients()
+        explained: Tensor = (w * (torch.einsum("...ij,...j->...i", self.xx, w) - 2 * self.xy)).sum(
+            dim=-1
         )
+        return explained + self.yy
 
 
 class FittedCost(NamedTuple):
@@ -102,6 +127,13 @@ def _r2(predicted: Tensor, observed: Tensor) -> float:
     return float(1 - residual / spread) if spread > 1e-18 else 1.0
 
 
+def _moments(z: Float[Tensor, "N T m"], target: Float[Tensor, "N T"]) -> _Moments:
+    """Means over the episodes, for every time step."""
+    x, y = _monomials(z.transpose(0, 1)), target.T.unsqueeze(-1)
+    count = len(z)
+    return _Moments(x.mT @ x / count, (x.mT @ y).squeeze(-1) / count, target.square().mean(dim=0))
+
+
 def _fit_shared(
     z: Float[Tensor, "N T m"], target: Float[Tensor, "N T"], settings: CostFit
 ) -> _Quadratic:
@@ -111,8 +143,8 @@ def _fit_shared(
         torch.zeros(m, dtype=z.dtype, device=z.device),
         torch.zeros((), dtype=z.dtype, device=z.device),
     )
-    flat, y = z.flatten(0, 1), target.flatten()
-    return _minimise(start, lambda q: (q.value(flat) - y).square().mean(), settings)
+    moments = _Moments(*(part.mean(dim=0) for part in _moments(z, target)))
+    return _minimise(start, moments.error, settings)
 
 
 def _fit_each(
@@ -124,23 +156,17 @@ def _fit_each(
     """One fit a time step; samples of neighbouring steps count with a Gaussian weight."""
     horizon = z.shape[1]
     times = torch.arange(horizon, device=z.device)
+    distance = (times[:, None] - times).abs()
     reach = max(1, round(2 * settings.width))
-    offsets = torch.arange(-reach, reach + 1, device=z.device)
-    near = times[:, None] + offsets
-    inside = (near >= 0) & (near < horizon)
-    weight = torch.exp(-0.5 * (offsets / settings.width).square()) * inside
+    weight = torch.exp(-0.5 * (distance / settings.width).square()) * (distance <= reach)
     weight = (weight / weight.sum(dim=1, keepdim=True)).to(z.dtype)
-    near = near.clamp(0, horizon - 1)
-    # (T, neighbours x N, m): every time step sees its own and its neighbours' samples.
-    samples = z[:, near].permute(1, 2, 0, 3).flatten(1, 2)
-    observed = target[:, near].permute(1, 2, 0).flatten(1, 2)
-    weights = weight.repeat_interleave(len(z), dim=1) / len(z)
+    own = _moments(z, target)
+    moments = _Moments(*(torch.einsum("ts,s...->t...", weight, part) for part in own))
     start = _Quadratic(*(part.expand(horizon, *part.shape).clone() for part in shared))
 
     def objective(q: _Quadratic) -> Tensor:
-        error = (weights * (q.value(samples) - observed).square()).sum()
         pull = sum((a - b).square().sum() for a, b in zip(q, shared, strict=True))
-        return error + PULL * pull
+        return moments.error(q).sum() + PULL * pull
 
     return _minimise(start, objective, settings)
 
