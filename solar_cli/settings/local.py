@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from solar_cli.settings.networks import FULLY_CONNECTED, KEY_POINTS, Layer
+from solar_cli.settings.networks import BUMPS, KEY_POINTS, Layer
 from solar_cli.settings.schema import Settings, setting
 
 Positive = Annotated[float, Field(gt=0)]
@@ -42,16 +42,18 @@ class Representation(Settings):
     variance: Positive | Literal["learned"] = setting(
         "learned", "variance of q(z|s): a learned diagonal, or this number"
     )
-    decoder: tuple[Layer, ...] = setting(FULLY_CONNECTED, "hidden layers of the observation model")
+    decoder: tuple[Layer, ...] = setting(BUMPS, "observation network, applied to each frame")
     likelihood: Literal["calibrated", "bernoulli", "categorical", "gaussian"] = setting(
         "calibrated",
         "p(s|z): Gaussian with the best common scale on an image pyramid, or as App. D says",
     )
     nats: float = setting(
-        64.0, "calibrated: half the dimensions of a frame that count, weight of the log error", gt=0
+        512.0,
+        "calibrated: half the dimensions of a frame that count, weight of the log error",
+        gt=0,
     )
     pyramid: bool = setting(
-        True, "calibrated: errors of pooled frames count too, so that small misplaced things do"
+        False, "calibrated: errors of pooled frames count too, so that small misplaced things do"
     )
     input: Literal["standardised", "unit"] = setting(
         "standardised", "(x - mean image) / pixel std, or x in [0, 1]"

@@ -11,7 +11,7 @@ from torch.nn import functional
 from solar_cli.errors import UsageError
 from solar_cli.models.networks import build
 from solar_cli.settings import load_card, resolve
-from solar_cli.settings.networks import FULLY_CONNECTED, KEY_POINTS, Layer
+from solar_cli.settings.networks import BUMPS, KEY_POINTS, Layer
 
 LAYERS = TypeAdapter(tuple[Layer, ...])
 
@@ -228,7 +228,7 @@ SAWYER = [
         (REACHER, (3, 64, 64)),
         (SAWYER, (5,)),
         (KEY_POINTS, (2, 32, 32)),
-        (FULLY_CONNECTED, (4,)),
+        (BUMPS, (4,)),
         ([], (4,)),
     ],
 )
