@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solar_cli.envs.task import Task
-from solar_cli.errors import SolarError
+from solar_cli.errors import LostFiles
 from solar_cli.settings import TaskSettings
 from solar_cli.streams import Streams
 
@@ -271,8 +271,8 @@ class Environment:
             self._held.popitem(last=False)
         return episodes
 
-    def _lost(self, entry: Mapping[str, Any]) -> SolarError:
-        return SolarError(
+    def _lost(self, entry: Mapping[str, Any]) -> LostFiles:
+        return LostFiles(
             f"episodes {self._folder / entry['file']} are missing or damaged: restore the file, or "
             "start the cell anew with --redo"
         )

@@ -1,6 +1,7 @@
-"""The two errors a user may see: each message says what is wrong, where, and what to do.
+"""The errors a user may see: each message says what is wrong, where, and what to do.
 
 ``SolarError``            the command cannot go on (exit code 1)
+├── ``LostFiles``         what was stored in files is not there any more (exit code 1)
 └── ``UsageError``        the user's input is wrong (exit code 2)
 """
 
@@ -14,6 +15,10 @@ class SolarError(Exception):
     """An expected failure, shown to the user as one line without a traceback."""
 
     exit_code = 1
+
+
+class LostFiles(SolarError):
+    """Files of a cell are missing or damaged: once they are restored, it can go on."""
 
 
 class UsageError(SolarError):

@@ -23,7 +23,7 @@ def watching(json: bool, cells: int) -> Iterator[Report]:
     """What the scheduler reports its events to, as long as it computes that many cells."""
     if json:
         yield Lines(json_line)
-    elif console().is_terminal:
+    elif cells and console().is_terminal:
         from rich.live import Live
 
         board = Board(cells)

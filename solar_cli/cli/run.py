@@ -104,8 +104,9 @@ def command(
         plans = plan(store, matrix, wanted, redo=redo, retry=retry)
         work = [planned.cell for planned in plans if planned.is_work]
         require_free_label(store, work, label)
-        require_memory(work)
-        require_tasks(work)
+        if work:
+            require_memory(work)
+            require_tasks(work)
         if dry_run:
             from solar_cli.experiment.estimates import estimate
 

@@ -12,6 +12,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+from solar_cli.errors import LostFiles
 from solar_cli.store.checkpoints import CorruptCheckpoint, load, save
 from solar_cli.store.records import CheckpointRecord
 from solar_cli.store.results import CHECKPOINTS
@@ -38,19 +39,28 @@ class Checkpoints:
     def restore(self) -> tuple[CheckpointRecord, dict[str, Any]] | None:
         """The newest checkpoint whose file is what was committed; None without any.
 
-        Damaged ones are reported and forgotten, and so are files that a crash left.
+        Damaged ones are reported and forgotten, and so are files that a crash left. Raises
+        `LostFiles` where none is left of a cell that has results: to begin anew would discard them.
         """
         known = self._store.checkpoints(self._cell)
+        damages = []
         for position, record in enumerate(known):
             try:
                 found = record, load(self._folder / record.path, record.sha256)
             except CorruptCheckpoint as error:
-                self._report(f"{error}; going on from the one before")
+                damages.append(str(error))
             else:
+                for damage in damages:
+                    self._report(f"{damage}; going on from the one before")
                 self._keep(known[position:])
                 return found
-        if known:
-            self._report("no sound checkpoint is left; starting anew")
+        if known and (known[0].complete or known[0].iteration > 1):
+            raise LostFiles(
+                f"checkpoints {', '.join(record.path for record in known)} in {self._folder} are "
+                "missing or damaged: restore one of them, or start the cell anew with --redo"
+            )
+        for damage in damages:
+            self._report(f"{damage}; starting anew")
         self._keep([])
         return None
 

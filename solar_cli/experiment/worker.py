@@ -24,7 +24,7 @@ from collections.abc import Sequence
 
 from sqlalchemy.exc import DBAPIError
 
-from solar_cli.errors import SolarError
+from solar_cli.errors import LostFiles, SolarError
 from solar_cli.experiment.messages import Message
 from solar_cli.store.records import Fenced, Outcome
 from solar_cli.store.store import Store
@@ -148,11 +148,14 @@ def _failure(error: Exception) -> tuple[Outcome, str]:
 
 
 def _from_outside(error: BaseException | None) -> bool:
-    """Whether the disk is full or the database fails: the next run goes on, without --retry."""
+    """Whether disk or database fail, or files are gone: the next run goes on, without --retry.
+
+    Nor does it need --retry to be content with the episodes that the cell has.
+    """
     if error is None:
         return False
     full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
-    return full or isinstance(error, DBAPIError) or _from_outside(error.__cause__)
+    return full or isinstance(error, DBAPIError | LostFiles) or _from_outside(error.__cause__)
 
 
 def prepare_torch(device: str) -> str:

@@ -13,7 +13,7 @@ from bits import OF_THE_MACHINE, files_of, fingerprint, metric_digest, state_dig
 
 from solar_cli.envs.task import RowTask
 from solar_cli.episodes import Environment
-from solar_cli.errors import SolarError
+from solar_cli.errors import LostFiles, SolarError
 from solar_cli.experiment import checkpointing, session
 from solar_cli.experiment.judge import Judge
 from solar_cli.experiment.messages import Message
@@ -289,16 +289,36 @@ def test_the_checkpoint_before_a_damaged_one_is_used(
     assert fingerprint(store, cell.hash) == quiet(cell)
 
 
-def test_a_cell_without_a_sound_checkpoint_starts_anew_and_says_so(
+def test_without_a_sound_checkpoint_nothing_that_was_evaluated_is_discarded(
     store: Store, cell: Cell, quiet: Callable[[Cell], dict[str, str]]
 ) -> None:
     attempt(store, cell, target=8)
+    kept, rows = store.checkpoints(cell.hash), store.metrics(hashes=[cell.hash])
+    sound = {path: path.read_bytes() for path in files_of(store, cell.hash)}
+    for path in sound:
+        flip(path)
+    for _ in range(2):
+        with pytest.raises(LostFiles, match=r"0002-.*\.pt.*--redo"):
+            attempt(store, cell)
+        assert store.checkpoints(cell.hash) == kept
+        assert store.metrics(hashes=[cell.hash]) == rows
+    restored = store.folder(cell.hash) / kept[1].path
+    restored.write_bytes(sound[restored])
+    attempt(store, cell)
+    assert fingerprint(store, cell.hash) == quiet(cell)
+
+
+def test_without_a_sound_checkpoint_a_first_iteration_starts_anew_and_says_so(
+    store: Store, cell: Cell, quiet: Callable[[Cell], dict[str, str]]
+) -> None:
+    with pytest.raises(Stopped):
+        attempt(store, cell, Boss(stop_at=2, activity="walking"))
     records = store.checkpoints(cell.hash)
     for record in records:
         flip(store.folder(cell.hash) / record.path)
     made = attempt(store, cell)
-    assert len(made.notes) == len(records) + 1
-    assert "anew" in made.notes[-1]
+    assert len(made.notes) == len(records)
+    assert all("anew" in note for note in made.notes)
     assert fingerprint(store, cell.hash) == quiet(cell)
 
 

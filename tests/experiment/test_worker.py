@@ -18,6 +18,7 @@ from solar_cli.experiment.matrix import plan
 from solar_cli.experiment.messages import LONGEST, Message
 from solar_cli.experiment.scheduler import Event, Result, run
 from solar_cli.experiment.worker import Orphaned, Pipe, compute
+from solar_cli.reporting.curves import problems
 from solar_cli.settings import Cell
 from solar_cli.store.owner import Owner
 from solar_cli.store.records import Outcome
@@ -184,12 +185,50 @@ def test_a_database_that_fails_interrupts_and_does_not_fail(
     assert compute(store, options, ends[1]) == (Outcome.INTERRUPTED, "locked")
 
 
-def claimed(store: Store, cell: Cell) -> Namespace:
+@pytest.mark.parametrize("lost", ["episodes/0001-0.npz", "checkpoints/*"])
+def test_a_finished_cell_that_has_lost_files_keeps_its_results_and_says_what_to_do(
+    store: Store,
+    make_cells: MakeCells,
+    ends: tuple[int, Pipe],
+    monkeypatch: pytest.MonkeyPatch,
+    lost: str,
+) -> None:
+    monkeypatch.setattr(worker, "prepare_torch", lambda device: device)
+    [cell] = make_cells()
+
+    def attempt(target: int) -> tuple[Outcome, str]:
+        options = claimed(store, cell, target)
+        outcome, error = compute(store, options, ends[1])
+        store.end(cell.hash, options.attempt, outcome, error)
+        return outcome, error or ""
+
+    assert attempt(4) == (Outcome.FINISHED, "")
+    rows = store.metrics(hashes=[cell.hash])
+    files = {path: path.read_bytes() for path in store.folder(cell.hash).glob(lost)}
+    for path in files:
+        path.unlink()
+    outcome, error = attempt(8)
+    assert outcome is Outcome.INTERRUPTED  # what was asked for is not there, but no --retry is due
+    assert all(path.name in error for path in files)
+    assert "restore" in error
+    assert "--redo" in error
+    assert "\n" not in error
+    assert store.metrics(hashes=[cell.hash]) == rows
+    [task] = problems(store)
+    assert list(task.curves[0].grid) == [0, 4]
+    if "episodes" in lost:  # it can still be content with what it has
+        assert attempt(4) == (Outcome.FINISHED, "")
+    for path, data in files.items():
+        path.write_bytes(data)
+    assert attempt(8) == (Outcome.FINISHED, "")
+
+
+def claimed(store: Store, cell: Cell, target: int = 12) -> Namespace:
     """What the supervisor tells the worker."""
     store.add([cell])
-    number = store.claim(cell.hash, Owner.current(), 12, {})
+    number = store.claim(cell.hash, Owner.current(), target, {})
     return Namespace(
-        cell=cell.hash, attempt=number, target=12, device="cpu", checkpoint_seconds=60.0
+        cell=cell.hash, attempt=number, target=target, device="cpu", checkpoint_seconds=60.0
     )
 
 
