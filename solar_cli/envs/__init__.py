@@ -22,6 +22,7 @@ SIMULATORS = {
     "navigation": "solar_cli.envs.navigation",
     "car": "solar_cli.envs.car",
     "reacher": "solar_cli.envs.reacher",
+    "sawyer": "solar_cli.envs.sawyer",
 }
 """name on a card -> module, imported when used"""
 

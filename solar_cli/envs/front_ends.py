@@ -33,6 +33,7 @@ IDS = {
     "Solar/Car-v0": "car",
     "Solar/CarStates-v0": "car-states",
     "Solar/Reacher-v0": "reacher",
+    "Solar/Sawyer-v0": "sawyer",
 }
 """Gymnasium id -> card"""
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}
