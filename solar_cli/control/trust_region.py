@@ -20,6 +20,11 @@ from solar_cli.control.step_size import StepSize
 from solar_cli.episodes import Episodes
 
 
+LEAST_PROMISE = 0.05
+"""Share of what has been gained so far below which an update is tried before it is handed over: a
+model is no better than that, and the update may lose much (car: 0.2 to 2.0 for a promise of 1 %)."""
+
+
 class Anchor(NamedTuple):
     """A policy that was tried, the iteration that holds its episodes, and what they cost."""
 
@@ -51,11 +56,13 @@ class TrustRegion:
     """fall of the cost that was measured for it"""
     rejected: bool = False
     """whether the last policy was worse than the best, and taken back"""
+    first: float = math.nan
+    """cost of the first policy, which knows nothing"""
 
     def judged(self, tried: Anchor, tolerance: float | Literal["never"]) -> TrustRegion:
         """Build upon what was just tried, or go back to the best; the step is adapted."""
         if self.best is None or self.current is None:
-            return replace(self, best=tried, current=tried)
+            return replace(self, best=tried, current=tried, first=tried.cost)
         kept = self.current.cost - tried.cost
         margin = math.hypot(tried.error, self.best.error)
         if tolerance != "never" and tried.cost > self.best.cost + tolerance * margin:
@@ -76,6 +83,11 @@ class TrustRegion:
         assert self.current is not None
         return self.current
 
+    def trusts(self, promised: float) -> bool:
+        """Whether an update that promises this fall of the cost may be handed over untried."""
+        assert self.best is not None
+        return promised >= LEAST_PROMISE * (self.first - self.best.cost)
+
     def metrics(self) -> dict[str, float]:
         """What the last update promised and gave, once there was one, and what follows."""
         falls = {"predicted_improvement": self.promised, "actual_improvement": self.kept}
@@ -92,6 +104,7 @@ class TrustRegion:
             "best": _plain(self.best),
             "current": _plain(self.current),
             "promised": self.promised,
+            "first": self.first,
         }
 
     def restored(self, state: dict[str, Any]) -> TrustRegion:
@@ -102,6 +115,7 @@ class TrustRegion:
             best=_anchor(state["best"]),
             current=_anchor(state["current"]),
             promised=state["promised"],
+            first=state["first"],
         )
 
 

@@ -53,6 +53,7 @@ class LocalLearner(ABC):
         self.gains = initial_policy(
             task.horizon, self.representation.state_size, task.action.size, task.exploration.std
         )
+        self.handed = self.gains
         low, high = settings.update.multiplier
         self.trust_region = TrustRegion(StepSize(low=low, high=high))
         self.updates = 0
@@ -63,9 +64,12 @@ class LocalLearner(ABC):
 
     @property
     def policy(self) -> LatentPolicy:
-        """The newest policy, not yet tried: one constrained step from episodes that were."""
+        """The newest policy, or the one that it was made from where it promises little."""
+        return self._acting(self.handed)
+
+    def _acting(self, gains: LinearGaussianPolicy) -> LatentPolicy:
         return LatentPolicy(
-            self.gains,
+            gains,
             self.representation,
             self.task.observation.window,
             self.task.exploration.smoothing,
@@ -89,9 +93,10 @@ class LocalLearner(ABC):
         """Line 4: episodes of the current policy, judged without noise where the card says so."""
         batches = self.settings.batches
         count = batches.initial if experience.iteration == 1 else batches.noisy
-        judged = experience.collect(self.policy, count)
+        newest = self._acting(self.gains)
+        judged = experience.collect(newest, count)
         if batches.noise_free:
-            judged = experience.collect(self.policy, batches.noise_free, noisy=False)
+            judged = experience.collect(newest, batches.noise_free, noisy=False)
         if not np.isfinite(judged.costs).all():
             raise Diverged(f"a cost of iteration {experience.iteration} is not finite")
         return Anchor.of(experience.iteration, self.gains, judged)
@@ -127,11 +132,19 @@ class LocalLearner(ABC):
             states, self.task.action_cost, self.settings.cost_fit, self.latent
         )
 
-    def adopt(self, region: TrustRegion, promised: float, update: PolicyUpdate) -> dict[str, float]:
+    def adopt(
+        self,
+        region: TrustRegion,
+        previous: LinearGaussianPolicy,
+        promised: float,
+        update: PolicyUpdate,
+    ) -> dict[str, float]:
         """Make the update the policy to try next; metrics of the step."""
         if not all(bool(torch.isfinite(part).all()) for part in update.policy):
             raise Diverged("the updated policy is not finite")
         self.gains = update.policy
+        trusted = self.settings.update.reject == "never" or region.trusts(promised)
+        self.handed = update.policy if trusted else previous
         self.trust_region = replace(region, promised=promised)
         self.updates += 1
         stuck = update.outcome in (Outcome.NOT_POSITIVE_DEFINITE, Outcome.BRACKET_EXHAUSTED)
@@ -141,6 +154,7 @@ class LocalLearner(ABC):
             "policy_std": float(torch.linalg.eigvalsh(update.policy.S).clamp_min(0).sqrt().mean()),
             "dual": update.eta,
             "update_failed": float(stuck),
+            "handed_over_untried": float(trusted),
         }
 
     def diagnose(self, evaluation: Evaluation) -> dict[str, float]:
@@ -161,6 +175,7 @@ class LocalLearner(ABC):
         return {
             "representation": self.representation.state_dict(),
             "gains": [gain.clone() for gain in self.gains],
+            "handed": [gain.clone() for gain in self.handed],
             "trust_region": self.trust_region.state_dict(),
             "updates": self.updates,
         }
@@ -169,6 +184,7 @@ class LocalLearner(ABC):
         """Take up a saved state."""
         self.representation.load_state_dict(state["representation"])
         self.gains = LinearGaussianPolicy(*state["gains"])
+        self.handed = LinearGaussianPolicy(*state["handed"])
         self.trust_region = self.trust_region.restored(state["trust_region"])
         self.updates = state["updates"]
 

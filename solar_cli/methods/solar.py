@@ -52,5 +52,5 @@ class Solar(LocalLearner):
             "cost_r2": cost.r2,
             "cost_per_time": float(cost.per_time),
             "linearisation_residual": previous.residual,
-            **self.adopt(region, promised, update),
+            **self.adopt(region, previous.policy, promised, update),
         }

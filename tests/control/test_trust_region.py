@@ -184,6 +184,16 @@ def test_a_promise_is_the_fall_of_what_is_collected():
     assert found == pytest.approx(collected(*before) - collected(*now), rel=1e-9)
 
 
+def test_an_update_is_handed_over_untried_for_a_twentieth_of_what_was_gained():
+    state = after(100.0, 80.0, 60.0, 70.0)  # the last one is taken back
+    assert state.first == 100.0
+    assert state.best.cost == 60.0
+    assert state.trusts(2.1)
+    assert not state.trusts(1.9)
+    assert not state.trusts(math.nan)
+    assert after(100.0).trusts(0.0)  # before anything was gained
+
+
 @pytest.mark.parametrize("costs", [(), (10.0,), (10.0, 11.0), (10.0, 20.0)])
 def test_a_saved_trust_region_goes_on_as_it_would_have(costs):
     state = after(*costs)
@@ -193,7 +203,7 @@ def test_a_saved_trust_region_goes_on_as_it_would_have(costs):
     restored = region().restored(torch.load(buffer, weights_only=True))
     for cost in (9.0, 12.0, 30.0):
         left, right = (s.judged(tried(7, cost), 1.0) for s in (state, restored))
-        for name in ("step", "kept", "rejected", "promised"):
+        for name in ("step", "kept", "rejected", "promised", "first"):
             assert str(getattr(left, name)) == str(getattr(right, name)), name
         for name in ("best", "current"):
             one, other = getattr(left, name), getattr(right, name)

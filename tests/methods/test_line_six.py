@@ -54,7 +54,7 @@ def test_a_changed_head_is_undone_by_line_six_alone(tmp_path, linearise, preserv
     run.learner.representation.moved = True
     assert change(run, episodes) > 0.3
     states = run.learner.embedded(episodes)
-    run.learner.gains = run.learner.linearised(region, states).policy
+    run.learner.handed = run.learner.linearised(region, states).policy
     # The new latents are an affine map of the old ones, which a linear policy can undo.
     assert (change(run, episodes) < 0.01) == preserved
     if not preserved:
@@ -81,7 +81,7 @@ def test_fine_tuning_preserves_the_acting_policy(tmp_path, monkeypatch):
             run.iterate(3, 3)
         assert run.learner.representation.moved
         episodes = run.environment.collected(run.learner.trust_region.current.iteration)
-        run.learner.gains = improved[0]
+        run.learner.handed = improved[0]
         errors[linearise] = change(run, episodes)
     # What is left is what no linear policy on the new latents does: the change is not affine.
     assert errors["true"] < 0.2
