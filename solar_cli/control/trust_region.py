@@ -19,7 +19,6 @@ from solar_cli.control.linear_gaussian import (
 from solar_cli.control.step_size import StepSize
 from solar_cli.episodes import Episodes
 
-
 LEAST_PROMISE = 0.05
 """Share of what has been gained so far below which an update is tried before it is handed over: a
 model is no better than that, and the update may lose much (car: 0.2 to 2.0 for a promise of 1 %)."""
@@ -68,9 +67,12 @@ class TrustRegion:
         if tolerance != "never" and tried.cost > self.best.cost + tolerance * margin:
             step = self.step.after_rejection()
             return replace(self, current=self.best, step=step, kept=kept, rejected=True)
+        step = self.step.after(self.promised, kept)
+        if step.multiplier > self.step.multiplier and not self.trusts(self.promised):
+            step = self.step  # what is left to gain is small: no larger step is needed
         return replace(
             self,
-            step=self.step.after(self.promised, kept),
+            step=step,
             best=tried if tried.cost < self.best.cost else self.best,
             current=tried,
             kept=kept,

@@ -31,9 +31,9 @@ from solar_cli.settings.local import LocalMethod
 from solar_cli.streams import Streams
 
 ACTIVE_SHARE = 0.9  # of a latent's variance that its mean must carry for it to count as active
-LEAST_EXPLAINED = 0.5  # of the variance of each channel
+LEAST_EXPLAINED = 0.4  # of the variance of each channel; a dead one has next to nothing
 LEAST_COST_R2 = 0.5
-JUDGED_FRAMES = 2000  # decoded at most to judge a batch: bounds memory
+JUDGED_FRAMES = 600  # decoded at most to judge a batch: bounds memory
 
 CostScore = Callable[["Representation", Episodes, Episodes], float]
 """R2 on the latter episodes of the cost that control would fit on the former."""

@@ -2,6 +2,7 @@
 
 import io
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -124,12 +125,20 @@ def test_the_best_never_gets_worse_nor_is_it_replaced_by_an_equal():
 
 
 def test_the_step_follows_what_was_promised_and_kept():
-    promised = region(promised=4.0, best=tried(1, 10.0), current=tried(1, 10.0))
+    promised = region(promised=4.0, first=10.0, best=tried(1, 10.0), current=tried(1, 10.0))
     assert promised.judged(tried(2, 6.0), 1.0).step == StepSize(low=0.3, high=2.0).after(4.0, 4.0)
     assert promised.judged(tried(2, 6.0), 1.0).step.multiplier == 2.0
     assert promised.judged(tried(2, 8.0), 1.0).step.multiplier == 1.0
     assert promised.judged(tried(2, 9.9), 1.0).step.multiplier < 0.6
     assert promised.judged(tried(2, 99.0), 1.0).step.multiplier == pytest.approx(0.4)
+
+
+def test_a_promise_that_is_small_beside_what_was_gained_makes_no_step_larger():
+    late = region(promised=4.0, first=100.0, best=tried(1, 10.0), current=tried(1, 10.0))
+    assert late.judged(tried(2, 6.0), 1.0).step.multiplier == 1.0
+    assert late.judged(tried(2, 9.9), 1.0).step.multiplier < 0.6  # but a smaller one
+    early = replace(late, first=80.0)
+    assert early.judged(tried(2, 6.0), 1.0).step.multiplier == 2.0
 
 
 def test_metrics_say_what_happened():
