@@ -21,7 +21,8 @@ from solar_cli.episodes import Episodes
 
 LEAST_PROMISE = 0.05
 """Share of what has been gained so far below which an update is tried before it is handed over: a
-model is no better than that, and the update may lose much (car: 0.2 to 2.0 for a promise of 1 %)."""
+model is no better than that, and the update may lose much (car: 0.2 to 2.0 for a promise of 1 %)
+"""
 
 
 class Anchor(NamedTuple):
