@@ -1,6 +1,6 @@
 """What local methods share around Algorithm 1: the policy, the trust region, the metrics.
 
-A local method gives `make_prior` (or another representation) and `iterate`.
+A local method gives `make_prior` and `iterate`.
 """
 
 from __future__ import annotations
