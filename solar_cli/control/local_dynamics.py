@@ -21,7 +21,7 @@ from torch import Tensor
 
 from solar_cli.control.linear_gaussian import LinearDynamics
 from solar_cli.control.trajectories import Trajectories
-from solar_cli.inference import gmm, mniw
+from solar_cli.inference import cholesky, gmm, mniw
 from solar_cli.models.priors import LatentPrior
 from solar_cli.settings.local import LocalFit
 from solar_cli.streams import Streams
@@ -220,9 +220,9 @@ def _log_density(
     """log N(residual | 0, Sigma)."""
     factor = torch.linalg.cholesky(Sigma)
     white = torch.linalg.solve_triangular(factor, residual.mT, upper=False)
-    log_determinant = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(dim=-1)
+    log_determinant = cholesky.log_determinant(factor)[:, None]
     constant = residual.shape[-1] * math.log(2 * math.pi)
-    density: Tensor = -0.5 * (white.square().sum(dim=-2) + log_determinant[:, None] + constant)
+    density: Tensor = -0.5 * (white.square().sum(dim=-2) + log_determinant + constant)
     return density
 
 

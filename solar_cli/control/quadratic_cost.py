@@ -3,10 +3,14 @@
 The action's part is known; L, c and b minimise the squared error of observed costs. L has a
 positive diagonal, so that C = L L^T is positive definite. Fits run in whitened latents and
 standardised costs, where one optimiser setting serves every task.
+
+Axes: N episodes, T horizon, n samples of a fit, m features of z, q monomials of them. The leading
+axis k is of fits that are made at once: T, or none.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -24,7 +28,7 @@ PULL = 1e-3  # of a fit per time step towards the global one, on standardised co
 
 
 class _Quadratic(NamedTuple):
-    """Parameters of one or several fits over m features of z."""
+    """Parameters of one or several fits."""
 
     L: Float[Tensor, "*k m m"]
     c: Float[Tensor, "*k m"]
@@ -139,7 +143,7 @@ def _fit_shared(
 ) -> _Quadratic:
     m = z.shape[-1]
     start = _Quadratic(
-        torch.zeros(m, m, dtype=z.dtype, device=z.device) - 1.0 * torch.eye(m, device=z.device),
+        torch.zeros(m, m, dtype=z.dtype, device=z.device) - torch.eye(m, device=z.device),
         torch.zeros(m, dtype=z.dtype, device=z.device),
         torch.zeros((), dtype=z.dtype, device=z.device),
     )
@@ -171,7 +175,9 @@ def _fit_each(
     return _minimise(start, objective, settings)
 
 
-def _minimise(start: _Quadratic, objective, settings: CostFit) -> _Quadratic:  # type: ignore[no-untyped-def]
+def _minimise(
+    start: _Quadratic, objective: Callable[[_Quadratic], Tensor], settings: CostFit
+) -> _Quadratic:
     parameters = [part.detach().clone().requires_grad_() for part in start]
     quadratic = _Quadratic(*parameters)
     optimiser: torch.optim.Optimizer

@@ -32,6 +32,7 @@ from solar_cli.settings import Cell, load, method
 from solar_cli.store.records import CheckpointRecord, Metric
 from solar_cli.store.store import Store
 from solar_cli.streams import Streams
+from solar_cli.wording import counted
 
 log = logging.getLogger(__name__)
 
@@ -100,7 +101,7 @@ class Session:
     @property
     def place(self) -> str:
         """Where it stands, for a message about what went wrong there."""
-        return f"iteration {self._iteration}, {self.environment.episodes} episodes"
+        return f"iteration {self._iteration}, {counted(self.environment.episodes, 'episode')}"
 
     @property
     def notes(self) -> list[str]:

@@ -6,12 +6,10 @@ It is conjugate: pairs (x, y) add their sufficient statistics to its natural par
 (A, B, C, nu) = (Psi + M V^-1 M^T, M V^-1, V^-1, nu). ``RegressionStatistics`` holds either.
 In SOLAR y is the next latent and x = [z; a], or [z; a; 1] for an affine map (Eq. 2-3, 5).
 
-Axes: N samples, d outputs (latent), p regressors. Leading axes (time steps, folds) are batch axes.
-Functions that sum over samples take them on the axis before the last; functions of one sample
-broadcast the batch axes of the belief against the leading axes of the samples, so a belief a time
-step (T ...) meets samples (N T ...) as they are. Everything is computed in float64: conversions
-between the two forms lose half of the digits. Matrices that are not positive definite raise
-``torch.linalg.LinAlgError``.
+Axes: N samples, d outputs (latent), p regressors; samples are summed over the axis before the last.
+Leading axes (time steps, folds) are batch axes, and broadcast. Everything is computed in float64:
+conversions between the two forms lose half of the digits. Matrices that are not positive definite
+raise ``torch.linalg.LinAlgError``.
 """
 
 from __future__ import annotations
@@ -220,12 +218,3 @@ def centred(statistics: RegressionStatistics, constant: int) -> RegressionStatis
         xx[..., keep, :][..., keep] - x_sum @ x_sum.mT / count,
         (n - 1).clamp(min=0),
     )
-
-
-def _form(
-    matrix: Float[Tensor, "*#sample i j"],
-    left: Float[Tensor, "*#sample i"],
-    right: Float[Tensor, "*#sample j"],
-) -> Float[Tensor, "*sample"]:
-    """left^T A right; the matrix is not copied along axes on which it broadcasts."""
-    return (left * torch.einsum("...ij,...j->...i", matrix, right)).sum(-1)

@@ -1,6 +1,6 @@
 """What local methods share around Algorithm 1: the policy, the trust region, the metrics.
 
-A local method gives `make_prior` (or another representation) and `iterate`.
+A local method gives `make_prior` and `iterate`.
 """
 
 from __future__ import annotations
@@ -120,9 +120,13 @@ class LocalLearner(ABC):
         return self.representation.dynamics_prior(older, as_it_stands=own)
 
     def linearised(self, region: TrustRegion, states: Trajectories) -> Linearisation:
-        """Line 6: the policy to improve, in the latents of now."""
-        gains = region.built_upon.gains
-        if self.representation.moved and self.settings.update.linearise:
+        """Line 6: the policy to improve, in the latents of now.
+
+        It acted on the latents from before its iteration's update: that one or a later one may have
+        changed them.
+        """
+        iteration, gains = region.built_upon.iteration, region.built_upon.gains
+        if self.representation.moved_in >= iteration and self.settings.update.linearise:
             return linearise_policy(states.z[:, :-1], states.action_means, gains)
         return Linearisation(gains, residual=0.0, ridge=0.0)
 

@@ -212,7 +212,8 @@ class LinearDynamics:
     ) -> tuple[Int[Tensor, "S n"], Float[Tensor, "S n"], Float[Tensor, " S"]]:
         """Time step t of each transition z_t -> z_{t+1}, its weight, and the weight of each start.
 
-        A time step weighs what there are starts for each that reaches it.
+        The weight is the number of starts a segment can have over that of those which reach t: the
+        inverse of the chance that a segment shows it.
         """
         device = start.device
         starts = self.horizon + 2 - length

@@ -63,8 +63,8 @@ class Representation:
         self.settings = settings
         self.task = task
         self.device = device
-        self.moved = False
-        """whether the last update changed what states mean"""
+        self.moved_in = 0
+        """the last iteration whose update changed what states mean; 0 before the first"""
         self._make_prior = make_prior
         self._cost_score = cost_score
         self._streams = streams
@@ -120,9 +120,8 @@ class Representation:
     def update(self, experience: Experience) -> dict[str, float]:
         """MODELUPDATE (Algorithm 1, line 5): train on the batches of the last B iterations."""
         recent = experience.recent(self.settings.training.buffer)
-        self.moved = False
         if not self._trained:
-            metrics = self._train_first(recent[-1])
+            metrics = self._train_first(experience.iteration, recent[-1])
         elif self.settings.training.fine_tune_steps:
             metrics = self._fine_tune(experience.iteration, recent)
         else:
@@ -130,7 +129,7 @@ class Representation:
             self._conclude(recent)
         return {**metrics, **self._model.prior.metrics()}
 
-    def _train_first(self, episodes: Episodes) -> dict[str, float]:
+    def _train_first(self, iteration: int, episodes: Episodes) -> dict[str, float]:
         """Train until a representation is alive, or take the best of the attempts."""
         training = self.settings.training
         kept = max(1, round(training.held_out * len(episodes)))
@@ -161,7 +160,7 @@ class Representation:
             "seconds_discarded": seconds - best.metrics["seconds_training"],
         }
         self._take_up(best.parameters)
-        self._trained = self.moved = True
+        self._trained, self.moved_in = True, iteration
         self._candidates = []
         return {**best.metrics, **discarded}
 
@@ -177,11 +176,13 @@ class Representation:
         name = f"iteration {iteration}"
         terms = self._trainer.fit(name, self._model, recent, steps, fine_tuning=True)
         self._before = None
-        self.moved = not self._alive(before.metrics) or self._alive(self._judge(newest))
-        if not self.moved:
+        kills = self._alive(before.metrics) and not self._alive(self._judge(newest))
+        if kills:
             self._take_up(before.parameters)
             self._conclude(recent)
-        return {**terms, **before.metrics, "fine_tuning_taken_back": float(not self.moved)}
+        else:
+            self.moved_in = iteration
+        return {**terms, **before.metrics, "fine_tuning_taken_back": float(kills)}
 
     def _conclude(self, batches: list[Episodes]) -> None:
         self._model.prior.conclude(self._posterior(Episodes.joined(batches)))
@@ -240,6 +241,7 @@ class Representation:
             "trainer": self._trainer.state_dict(),
             "candidates": [tuple(candidate) for candidate in self._candidates],
             "trained": self._trained,
+            "moved_in": self.moved_in,
             "before": None if self._before is None else tuple(self._before),
         }
 
@@ -248,7 +250,7 @@ class Representation:
         self._take_up(state["parameters"])
         self._trainer.load_state_dict(state["trainer"])
         self._candidates = [Candidate(*candidate) for candidate in state["candidates"]]
-        self._trained = state["trained"]
+        self._trained, self.moved_in = state["trained"], state["moved_in"]
         self._before = None if state["before"] is None else Candidate(*state["before"])
 
     def _untrained(self, attempt: int) -> LatentModel:

@@ -87,7 +87,7 @@ class Trainer:
         self._running = self._optimiser = None
         model.prior.conclude(data.posterior(model))
         seconds = running["seconds"] + time.perf_counter() - last
-        smoothed = {name: float(value) for name, value in running["terms"].items()}
+        smoothed = {term: float(value) for term, value in running["terms"].items()}
         return {**smoothed, "seconds_training": seconds}
 
     def _step(
@@ -124,12 +124,12 @@ class Trainer:
         return settings.kl_start + rise * (settings.kl_end - settings.kl_start)
 
     @staticmethod
-    def _smooth(terms: dict[str, float], new: dict[str, Tensor]) -> None:
+    def _smooth(terms: dict[str, Tensor], new: dict[str, Tensor]) -> None:
         for name, value in new.items():
             # Kept as tensors: reading a number would wait for the device at every step.
             value = value.detach().double()
             old = terms.get(name)
-            terms[name] = value if old is None else SMOOTHING * old + (1 - SMOOTHING) * value  # type: ignore[assignment]
+            terms[name] = value if old is None else SMOOTHING * old + (1 - SMOOTHING) * value
 
     @property
     def under_way(self) -> bool:

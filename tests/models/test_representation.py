@@ -302,11 +302,11 @@ def test_a_frozen_encoder_keeps_its_states_and_learns_its_dynamics():
     model = make(buffer=2)
     batches = [FIRST, *(vector_episodes(TASK, 5, seed=seed) for seed in (1, 2))]
     model.update(Collected(batches[0]))
-    assert model.moved
+    assert model.moved_in == 1
     states, basis, factor = model.embed(FIRST), model.basis, own_factor(model)
     for last in (2, 3):
         model.update(Collected(*batches[:last]))
-        assert not model.moved
+        assert model.moved_in == 1
     assert torch.equal(model.embed(FIRST), states)
     assert digest(list(model.basis)) == digest(list(basis))
     assert digest(own_factor(model)) == digest(conditioned(model, *batches[1:]))
@@ -331,7 +331,7 @@ def test_fine_tuning_moves_the_states_within_a_fixed_basis():
     model.update(Collected(FIRST))
     states, basis = model.embed(FIRST), model.basis
     metrics = model.update(Collected(FIRST, vector_episodes(TASK, 6, seed=7)))
-    assert model.moved
+    assert model.moved_in == 2
     assert metrics["fine_tuning_taken_back"] == 0.0
     assert not torch.allclose(model.embed(FIRST), states)
     assert digest(list(model.basis)) == digest(list(basis))
@@ -359,7 +359,7 @@ def test_fine_tuning_that_kills_is_taken_back(monkeypatch):
     second = vector_episodes(TASK, 6, seed=7)
     metrics = model.update(Collected(FIRST, second))
     assert metrics["fine_tuning_taken_back"] == 1.0
-    assert not model.moved
+    assert model.moved_in == 1
     assert digest(model.state_dict()["parameters"]["networks"]) == before
     # What the newest episodes say of the dynamics is not taken back.
     assert digest(own_factor(model)) == digest(conditioned(model, FIRST, second))
@@ -382,7 +382,7 @@ def test_what_was_dead_before_fine_tuning_is_tuned_all_the_same(monkeypatch):
     monkeypatch.setattr(Representation, "_alive", staticmethod(lambda _: False))
     metrics = model.update(Collected(FIRST, vector_episodes(TASK, 6, seed=7)))
     assert metrics["fine_tuning_taken_back"] == 0.0
-    assert model.moved
+    assert model.moved_in == 2
 
 
 def test_metrics_of_an_update_are_finite_numbers():
