@@ -37,7 +37,11 @@ class LatentModel:
         self.standard_normal = standard_normal
 
     def loss(self, batch: Minibatch, kl_weight: float) -> tuple[Tensor, Any, dict[str, Tensor]]:
-        """The negative ELBO in nats a frame, what the prior learns from, and the ELBO's terms."""
+        """The negative ELBO in nats a frame, what the prior learns from, and the ELBO's terms.
+
+        The prior's KL terms weigh every time step of an episode alike; the reconstruction is a mean
+        over the frames that were drawn, of which the first and last of an episode are fewer.
+        """
         scaled = self.networks.scaled(batch.frames.flatten(0, 1))
         mean, variance = self.networks.encode(scaled)
         sample = mean + variance.sqrt() * batch.noise.flatten(0, 1)

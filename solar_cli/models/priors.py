@@ -133,10 +133,12 @@ class DynamicsStatistics(NamedTuple):
     """frames that these terms judge: S times those of an episode"""
 
 
-class LinearDynamics:
+class BayesianLDS:
     """MNIW factors over (F, Sigma) and the NIW factor over (mu, Sigma_0), Eq. 2 to 5.
 
-    With ``factors = "shared"`` one factor explains every time step, else each has its own.
+    With ``factors = "shared"`` one factor explains every time step, else each has its own. Only whole
+    windows are judged: frames 1 to W - 1 of an episode stand in no term, and factors of time steps
+    before W - 1 stay the prior.
     """
 
     def __init__(

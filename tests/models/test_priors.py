@@ -13,7 +13,7 @@ from scipy import special, stats
 
 from solar_cli.inference import niw
 from solar_cli.models.priors import (
-    LinearDynamics,
+    BayesianLDS,
     Segments,
     StandardNormal,
     regressors,
@@ -35,7 +35,7 @@ every_form = pytest.mark.parametrize(
 
 def dynamics(factors="shared", rows="newest", window=1, **settings):
     task = vector_task(horizon=T, window=window, actions=a)
-    return LinearDynamics(Dynamics(factors=factors, rows=rows, **settings), d, task, "cpu")
+    return BayesianLDS(Dynamics(factors=factors, rows=rows, **settings), d, task, "cpu")
 
 
 def whole_episodes(seed=0, count=5):

@@ -12,7 +12,7 @@ from model_problems import vector_episodes, vector_task
 from solar_cli.episodes import Episodes, window_indices
 from solar_cli.errors import UsageError
 from solar_cli.models import representation, training
-from solar_cli.models.priors import LinearDynamics
+from solar_cli.models.priors import BayesianLDS
 from solar_cli.models.representation import Representation
 from solar_cli.settings.local import Solar
 from solar_cli.streams import Streams
@@ -71,7 +71,7 @@ def make(score=None, pulse=lambda *_: None, seed=0, task=TASK, **changes) -> Rep
     return Representation(
         settings,
         task,
-        lambda: LinearDynamics(settings.dynamics, 2, task, "cpu"),
+        lambda: BayesianLDS(settings.dynamics, 2, task, "cpu"),
         Scores(1.0) if score is None else score,
         Streams(seed),
         "cpu",
@@ -289,7 +289,7 @@ def test_a_checkpoint_can_be_made_again_before_anything_goes_on(fine_tune_steps)
 
 def conditioned(model: Representation, *batches: Episodes) -> list[torch.Tensor]:
     """The factor of a fresh prior after the closed form on these batches."""
-    closed = LinearDynamics(model.settings.dynamics, 2, TASK, "cpu")
+    closed = BayesianLDS(model.settings.dynamics, 2, TASK, "cpu")
     closed.conclude(model._model.posterior(Episodes.joined(list(batches)), "cpu"))
     return list(closed.factor)
 

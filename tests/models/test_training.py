@@ -16,7 +16,7 @@ from solar_cli.methods import Diverged
 from solar_cli.models import training
 from solar_cli.models.frames import FrameModel
 from solar_cli.models.latent_model import LatentModel
-from solar_cli.models.priors import LinearDynamics, StandardNormal
+from solar_cli.models.priors import BayesianLDS, StandardNormal
 from solar_cli.models.training import Dataset, Trainer
 from solar_cli.settings.local import Dynamics, Representation, Training
 from solar_cli.streams import Streams
@@ -35,7 +35,7 @@ def untrained(prior="linear", task=TASK) -> LatentModel:
     layers = ({"kind": "linear", "width": 6},)
     settings = Representation.model_validate({"latent": 2, "encoder": layers, "decoder": layers})
     networks = FrameModel(settings, task.observation)
-    chosen = LinearDynamics(Dynamics(), 2, task, "cpu") if prior == "linear" else StandardNormal()
+    chosen = BayesianLDS(Dynamics(), 2, task, "cpu") if prior == "linear" else StandardNormal()
     return LatentModel(networks, chosen, 0.05)
 
 
