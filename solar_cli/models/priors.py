@@ -136,9 +136,9 @@ class DynamicsStatistics(NamedTuple):
 class BayesianLDS:
     """MNIW factors over (F, Sigma) and the NIW factor over (mu, Sigma_0), Eq. 2 to 5.
 
-    With ``factors = "shared"`` one factor explains every time step, else each has its own. Only whole
-    windows are judged: frames 1 to W - 1 of an episode stand in no term, and factors of time steps
-    before W - 1 stay the prior.
+    With ``factors = "shared"`` one factor explains every time step, else each has its own. Only
+    whole windows are judged: frames 1 to W - 1 of an episode stand in no term, and factors of time
+    steps before W - 1 stay the prior.
     """
 
     def __init__(
