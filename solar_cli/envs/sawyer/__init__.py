@@ -1,0 +1,1 @@
+"""A Sawyer arm that stacks Lego bricks, in PyBullet or in MuJoCo."""
