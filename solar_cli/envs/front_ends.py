@@ -27,7 +27,11 @@ from solar_cli.settings.card import card_folders
 Array = NDArray[Any]
 Info = dict[str, Any]
 
-IDS = {"Solar/Navigation-v0": "nav", "Solar/NavigationFixed-v0": "nav-fixed"}
+IDS = {
+    "Solar/Navigation-v0": "nav",
+    "Solar/NavigationFixed-v0": "nav-fixed",
+    "Solar/Sawyer-v0": "sawyer",
+}
 """Gymnasium id -> card"""
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}
 
