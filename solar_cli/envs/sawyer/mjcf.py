@@ -16,9 +16,9 @@ STEP = 0.004
 CAMERA = "camera"
 LOWER = "lower_brick"
 """body and joint of the free brick"""
-# Angles are about fixed axes (capital letters). The armature stands for motor rotors. Contacts
-# are as stiff as the step allows: a brick sinks into another by tenths of a millimetre. Software
-# rendering takes its time for triangles, so round things have few.
+# Angles are about fixed axes (capital letters). The armature stands for the rotors of the motors.
+# Contacts are as stiff as the step allows: a brick sinks into another by tenths of a millimetre.
+# Software rendering takes its time for triangles, so round things have few.
 SCENE = """
 <mujoco model="sawyer">
   <compiler angle="radian" eulerseq="XYZ" autolimits="true"/>
