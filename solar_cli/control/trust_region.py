@@ -25,6 +25,11 @@ model is no better than that, and the update may lose much (car: 0.2 to 2.0 for 
 """
 
 
+NEXT_TO_NOTHING = 0.02
+"""Share of what has been gained so far by which a batch may always be worse than the best: where
+episodes hardly differ, their noise is so small that nothing would ever be built upon again."""
+
+
 class Anchor(NamedTuple):
     """A policy that was tried, the iteration that holds its episodes, and what they cost."""
 
@@ -64,8 +69,7 @@ class TrustRegion:
         if self.best is None or self.current is None:
             return replace(self, best=tried, current=tried, first=tried.cost)
         kept = self.current.cost - tried.cost
-        margin = math.hypot(tried.error, self.best.error)
-        if tolerance != "never" and tried.cost > self.best.cost + tolerance * margin:
+        if tolerance != "never" and tried.cost > self.best.cost + self._margin(tried, tolerance):
             step = self.step.after_rejection()
             return replace(self, current=self.best, step=step, kept=kept, rejected=True)
         step = self.step.after(self.promised, kept)
@@ -79,6 +83,12 @@ class TrustRegion:
             kept=kept,
             rejected=False,
         )
+
+    def _margin(self, tried: Anchor, tolerance: float) -> float:
+        """By how much a batch may be worse than the best: its noise, or next to nothing."""
+        assert self.best is not None
+        noise = tolerance * math.hypot(tried.error, self.best.error)
+        return max(noise, NEXT_TO_NOTHING * (self.first - self.best.cost))
 
     @property
     def built_upon(self) -> Anchor:

@@ -91,6 +91,12 @@ def test_the_tolerance_is_in_standard_errors(tolerance, taken_back):
     assert after(10.0, 11.5, tolerance=tolerance).rejected == taken_back
 
 
+def test_next_to_nothing_of_what_was_gained_is_tolerated_where_there_is_no_noise():
+    assert not after(100.0, 60.0, 60.7, error=1e-3).rejected
+    assert after(100.0, 60.0, 60.9, error=1e-3).rejected
+    assert after(100.0, 60.0, 60.7, 61.4, error=1e-3).rejected  # of the best, not of the last
+
+
 def test_without_rejection_anything_is_built_upon():
     state = after(10.0, 1e6, tolerance="never")
     assert state.current == tried(2, 1e6)
