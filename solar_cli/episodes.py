@@ -34,7 +34,11 @@ class Policy(Protocol):
     """What acts. Noise is drawn when an episode starts, so that it may be smooth over time."""
 
     def start(self, episodes: int, stream: np.random.Generator | None) -> Any:
-        """The state that ``act`` carries; without a stream the policy is noise-free."""
+        """The state that ``act`` carries; without a stream the policy is noise-free.
+
+        Episodes may come in groups, each with a call of its own and all with one stream: what is
+        drawn is drawn episode by episode.
+        """
 
     def act(self, observations: NDArray[Any], t: int, state: Any) -> tuple[Floats, Floats, Any]:
         """Actions (N, a) for windows (N, W, *frame) at step ``t``, their means, the state."""
@@ -95,6 +99,23 @@ class Evaluation:
     """(N, T+1, k) true positions, to diagnose latents with"""
     truth_names: tuple[str, ...] = ()
 
+    @staticmethod
+    def joined(parts: Sequence[Evaluation]) -> Evaluation:
+        """All episodes of several groups; ground truth that one of them lacks is missing in all."""
+        if len(parts) == 1:
+            return parts[0]
+        names = set.intersection(*(set(part.measures) for part in parts))
+        whole = all(part.truth_names for part in parts)
+        return Evaluation(
+            Episodes.joined([part.episodes for part in parts]),
+            {
+                name: np.concatenate([part.measures[name] for part in parts])
+                for name in sorted(names)
+            },
+            np.concatenate([part.truth if whole else part.truth[..., :0] for part in parts]),
+            parts[0].truth_names if whole else (),
+        )
+
     def summary(self) -> dict[str, Floats]:
         """One number an episode: return, and each measure's final and mean value."""
         summary = {"return": -self.episodes.costs.sum(axis=1)}
@@ -111,6 +132,19 @@ def window_indices(horizon: int, window: int) -> NDArray[np.int64]:
 
 
 def roll_out(
+    task: Task,
+    settings: TaskSettings,
+    policy: Policy,
+    resets: Sequence[np.random.Generator],
+    noise: np.random.Generator | None,
+) -> Evaluation:
+    """Run one episode for each reset stream, as many side by side as the task allows."""
+    size = task.at_once or len(resets)
+    groups = [resets[i : i + size] for i in range(0, len(resets), size)]
+    return Evaluation.joined([_run(task, settings, policy, group, noise) for group in groups])
+
+
+def _run(
     task: Task,
     settings: TaskSettings,
     policy: Policy,
@@ -139,14 +173,16 @@ def roll_out(
     return Evaluation(
         Episodes(frames, actions, means, costs, window),
         {name: np.stack([step[name] for step in measures], axis=1) for name in sorted(names)},
-        *_stacked(truths, task.truth_names),
+        *_stacked(truths, count, task.truth_names),
     )
 
 
-def _stacked(truths: list[Floats], names: tuple[str, ...]) -> tuple[Floats, tuple[str, ...]]:
+def _stacked(
+    truths: list[Floats], episodes: int, names: tuple[str, ...]
+) -> tuple[Floats, tuple[str, ...]]:
     """Positions of all steps, or none where one is missing."""
-    if any(truth.shape != (len(truths[-1]), len(names)) for truth in truths):
-        return np.empty((len(truths[-1]), len(truths), 0)), ()
+    if any(truth.shape != (episodes, len(names)) for truth in truths):
+        return np.empty((episodes, len(truths), 0)), ()
     return np.stack(truths, axis=1), names
 
 

@@ -32,6 +32,7 @@ class Sums:
     """The state is the sum of the actions so far; a frame is the state, and which step it is."""
 
     horizon, action_size, action_bound, truth_names = T, 1, BOUND, ("x",)
+    at_once: int | None = None
 
     def reset(self, streams):
         self.x = np.array([stream.uniform() for stream in streams])
@@ -142,6 +143,37 @@ def test_a_policy_sees_windows_that_end_at_the_present_frame(settings: TaskSetti
     roll_out(Sums(), settings, policy, [np.random.default_rng(0)], None)
     numbers = [shown[0, :, 1].tolist() for shown in policy.shown]
     assert numbers == [[0, 0, 0], [0, 0, 1], [0, 1, 2], [1, 2, 3], [2, 3, 4]]
+
+
+@pytest.mark.parametrize("at_once", [1, 3, 7, 20])
+def test_episodes_do_not_depend_on_how_many_run_side_by_side(settings: TaskSettings, at_once):
+    def run(task):
+        resets = [Streams(2).generator("reset", i) for i in range(7)]
+        return roll_out(task, settings, Pull(), resets, Streams(2).generator("noise"))
+
+    grouped = Sums()
+    grouped.at_once = at_once
+    found, whole = run(grouped), run(Sums())
+    for name in ("frames", "actions", "action_means", "costs"):
+        left, right = getattr(found.episodes, name), getattr(whole.episodes, name)
+        np.testing.assert_array_equal(left, right)
+    np.testing.assert_array_equal(found.truth, whole.truth)
+    assert found.summary().keys() == whole.summary().keys()
+    np.testing.assert_array_equal(found.measures["place"], whole.measures["place"])
+
+
+def test_ground_truth_that_a_group_lacks_is_missing_in_all(settings: TaskSettings):
+    task = Failing("truth", T)
+    task.at_once, starts = 2, iter([99, 1])
+    reset = task.reset
+    task.reset = lambda streams: (setattr(task, "first", next(starts)), reset(streams))[1]
+    resets = [Streams(2).generator("reset", i) for i in range(4)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = roll_out(task, settings, Pull(), resets, None)
+    assert found.truth.shape == (4, T + 1, 0)
+    assert found.truth_names == ()
+    assert found.measures["place"].shape == (4, T + 1)
 
 
 def test_executed_actions_are_clipped_and_costs_are_theirs(settings: TaskSettings):

@@ -30,6 +30,8 @@ class Task(Protocol):
     """largest absolute value of an action entry; larger ones are clipped"""
     truth_names: tuple[str, ...]
     """what the columns of `truth` are"""
+    at_once: int | None
+    """episodes that may run side by side, or None for any number"""
 
     def reset(self, streams: Sequence[np.random.Generator]) -> Frames:
         """Start one episode for each stream, which alone decides its initial state."""
@@ -83,6 +85,8 @@ class RowSimulator(Protocol):
 
 class RowTask:
     """A `Task` made of a `RowSimulator`: it holds the rows and clips the actions."""
+
+    at_once: int | None = None
 
     def __init__(self, simulator: RowSimulator, settings: TaskSettings) -> None:
         self.horizon = settings.horizon
@@ -144,6 +148,8 @@ class Simulation(Protocol):
 
 class LoopTask:
     """A `Task` made of one `Simulation` for each episode that runs side by side."""
+
+    at_once: int | None = 10  # a simulation may take 40 MB; more at once is hardly faster
 
     def __init__(self, make: Callable[[], Simulation], settings: TaskSettings) -> None:
         self.horizon = settings.horizon

@@ -20,6 +20,7 @@ class WatchedTask:
         self.action_size = task.action_size
         self.action_bound = task.action_bound
         self.truth_names = task.truth_names
+        self.at_once = task.at_once
         self._task = task
         self._progress = progress
         self._steps = 0
