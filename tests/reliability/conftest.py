@@ -8,9 +8,17 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "experiment"))  # where `bits` is
 
-from disturbed import Matrix, Undisturbed
+from disturbed import PATIENCE, Matrix, Undisturbed
 
 from solar_cli.store.store import Store
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Many processes, each of which imports torch: minutes alone, more beside other work."""
+    here = Path(__file__).parent
+    for item in items:
+        if item.path.parent == here:
+            item.add_marker(pytest.mark.timeout(4 * PATIENCE))
 
 
 @pytest.fixture
