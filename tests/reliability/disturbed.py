@@ -17,6 +17,8 @@ from bits import fingerprint
 from solar_cli.store.store import Store
 
 HERE = Path(__file__).parent
+PATIENCE = 900.0
+"""seconds for what takes a few on a machine of its own: a limit for what hangs, no measurement"""
 
 
 @dataclass
@@ -54,7 +56,7 @@ class Matrix:
     def die(self, where: str) -> None:
         """Run until the kill happens; fails when it does not."""
         scheduler = self.start(die=where)
-        scheduler.wait(timeout=120)
+        scheduler.wait(timeout=PATIENCE)
         done = (self.folder / "kills.txt").read_text().split()
         assert len(done) == self.kills + 1, f"no kill at {where}"
         self.kills += 1
@@ -64,11 +66,7 @@ class Matrix:
 
         ``who`` is ``workers``, ``scheduler`` or ``all``; nobody is left to kill after the end.
         """
-        scheduler = self.start()
-        started = time.time()
-        while scheduler.poll() is None and not self._computing(started):
-            time.sleep(0.02)
-        time.sleep(seconds)
+        scheduler = self._start_and_let_compute(seconds)
         victims = [] if who == "scheduler" else children(scheduler.pid)
         if who != "workers" and scheduler.poll() is None:
             victims.append(scheduler.pid)
@@ -76,7 +74,21 @@ class Matrix:
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
                 self.kills += 1
-        scheduler.wait(timeout=120)
+        scheduler.wait(timeout=PATIENCE)
+
+    def stop_after(self, seconds: float) -> bool:
+        """Ask it to stop when the first worker has computed for a time; whether it was not done."""
+        scheduler = self._start_and_let_compute(seconds)
+        scheduler.terminate()
+        return scheduler.wait(timeout=PATIENCE) == 1
+
+    def _start_and_let_compute(self, seconds: float) -> subprocess.Popen[bytes]:
+        scheduler = self.start()
+        started = time.time()
+        while scheduler.poll() is None and not self._computing(started):
+            time.sleep(0.02)
+        time.sleep(seconds)
+        return scheduler
 
     def _computing(self, since: float) -> bool:
         """Whether a worker has left its imports behind, and written something."""
@@ -89,7 +101,7 @@ class Matrix:
     def finish(self) -> list[dict[str, Any]]:
         """The next run, which nothing disturbs; what became of each cell."""
         self.results.unlink(missing_ok=True)
-        code = self.start(checkpoint_seconds=60.0).wait(timeout=300)
+        code = self.start(checkpoint_seconds=60.0).wait(timeout=PATIENCE)
         results: list[dict[str, Any]] = json.loads(self.results.read_text())
         assert (code == 0) == all(result["finished"] for result in results)
         return results

@@ -67,6 +67,7 @@ def inside_evaluation() -> None:
 
 
 MOMENTS: dict[str, Callable[[], None]] = {
+    "collecting": lambda: after(session.Session, "_collecting"),  # at a step of the simulator
     "collected": lambda: after(Environment, "collect"),
     "training": lambda: after(session.Session, "_pulse"),
     "updated": lambda: after(Environment, "summary"),  # a new policy, not yet evaluated

@@ -1,13 +1,12 @@
-"""Kills at random moments, of workers, schedulers or all of them, while two cells are computed."""
+"""Kills and stops at random moments while two cells are computed."""
 
 import random
 from collections.abc import Callable
 
-import pytest
 from disturbed import Matrix, Undisturbed
 
-pytestmark = pytest.mark.timeout(900)  # many processes, each of which imports torch
 KILLS = 8
+STOPS = 4
 
 
 def test_kills_at_random_moments_change_no_bit(
@@ -22,3 +21,16 @@ def test_kills_at_random_moments_change_no_bit(
         assert all(result["finished"] for result in run.finish())
         assert run.fingerprints() == undisturbed.fingerprints
         kills += run.kills
+
+
+def test_stops_at_random_moments_change_no_bit(
+    matrix: Callable[[int], Matrix], undisturbed: Undisturbed
+) -> None:
+    dice = random.Random(5)
+    stops = 0
+    while stops < STOPS:
+        run = matrix(2)
+        # Each goes on where the one before has stopped.
+        stops += sum(run.stop_after(dice.uniform(0.0, 0.5) * undisturbed.seconds) for _ in range(2))
+        assert all(result["finished"] for result in run.finish())
+        assert run.fingerprints() == undisturbed.fingerprints

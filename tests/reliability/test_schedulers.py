@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from disturbed import Matrix, Undisturbed
+from disturbed import PATIENCE, Matrix, Undisturbed
 
 from solar_cli.store.records import State
 from solar_cli.store.store import Store
@@ -14,7 +14,7 @@ def test_two_schedulers_compute_each_cell_once(
     run = matrix(2)
     both = [run.start(checkpoint_seconds=60.0) for _ in range(2)]
     for scheduler in both:
-        scheduler.wait(timeout=300)
+        scheduler.wait(timeout=PATIENCE)
     assert 0 in {scheduler.returncode for scheduler in both}
     assert run.fingerprints() == undisturbed.fingerprints
     with Store.open(run.db) as store:
@@ -28,7 +28,7 @@ def test_training_that_leaves_the_finite_numbers_ends_as_diverged(
 ) -> None:
     run = matrix(1)
     scheduler = run.start(sets=["methods.solar.training.learning_rate=1e30"])
-    assert scheduler.wait(timeout=300) == 1
+    assert scheduler.wait(timeout=PATIENCE) == 1
     with Store.open(run.db) as store:
         [record] = store.cells()
         assert record.state is State.DIVERGED
