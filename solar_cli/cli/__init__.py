@@ -12,6 +12,7 @@ import typer
 
 from solar_cli.cli import (
     compare,
+    diagnose,
     doctor,
     export,
     methods,
@@ -37,7 +38,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,  # it prints local variables, and one may hold a password
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for module in (run, status, show, report, compare, tasks, methods, export, rm, doctor):
+for module in (run, status, show, report, compare, diagnose, tasks, methods, export, rm, doctor):
     app.command(module.__name__.rpartition(".")[2])(module.command)
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from solar_cli.control.latent_policy import LatentPolicy
 from solar_cli.control.linear_gaussian import LinearGaussianPolicy, initial_policy
 from solar_cli.control.linearise import Linearisation, linearise_policy
+from solar_cli.control.local_dynamics import LocalDynamics, infer_dynamics
 from solar_cli.control.lqr import Outcome, PolicyUpdate
 from solar_cli.control.quadratic_cost import FittedCost, explained, fit_quadratic_cost
 from solar_cli.control.step_size import StepSize
@@ -46,10 +47,9 @@ class LocalLearner(ABC):
         self.task = task
         self.streams = streams
         self.device = device
+        self.pulse = pulse
         self.latent = settings.representation.latent
-        self.representation = Representation(
-            settings, task, self.make_prior, self._cost_score, streams, device, pulse
-        )
+        self.representation = self.make_representation()
         self.gains = initial_policy(
             task.horizon, self.representation.state_size, task.action.size, task.exploration.std
         )
@@ -61,6 +61,22 @@ class LocalLearner(ABC):
     @abstractmethod
     def make_prior(self) -> Prior:
         """The prior over latents that the representation is trained with."""
+
+    @abstractmethod
+    def iterate(self, experience: Experience) -> dict[str, float]:
+        """As `Learner.iterate`: one turn of Algorithm 1."""
+
+    def make_representation(self) -> Representation:
+        """An untrained representation."""
+        return Representation(
+            self.settings,
+            self.task,
+            self.make_prior,
+            self._cost_score,
+            self.streams,
+            self.device,
+            self.pulse,
+        )
 
     @property
     def policy(self) -> LatentPolicy:
@@ -129,6 +145,16 @@ class LocalLearner(ABC):
         if self.representation.moved_in >= iteration and self.settings.update.linearise:
             return linearise_policy(states.z[:, :-1], states.action_means, gains)
         return Linearisation(gains, residual=0.0, ridge=0.0)
+
+    def infer_dynamics(
+        self,
+        states: Trajectories,
+        older: list[Trajectories],
+        prior: LatentPrior,
+        streams: Streams,
+    ) -> LocalDynamics:
+        """Line 7: local dynamics around the newest latents."""
+        return infer_dynamics(states, older, prior, self.settings.local_fit, streams)
 
     def fitted_cost(self, states: Trajectories) -> FittedCost:
         """The quadratic cost of the newest latents (section 3)."""

@@ -7,7 +7,6 @@ another model into the same page.
 
 from __future__ import annotations
 
-from solar_cli.control.local_dynamics import infer_dynamics
 from solar_cli.control.lqr import improve_policy
 from solar_cli.control.trust_region import promised_fall
 from solar_cli.episodes import Experience
@@ -34,11 +33,10 @@ class Solar(LocalLearner):
         states, older_states = self.embedded(episodes), [self.embedded(batch) for batch in older]
 
         previous = self.linearised(region, states)  # line 6: LINEARIZEPOLICY, appendix C
-        dynamics = infer_dynamics(  # line 7: INFERDYNAMICS, section 4.1 and appendix B
+        dynamics = self.infer_dynamics(  # line 7: INFERDYNAMICS, section 4.1 and appendix B
             states,
             older_states,
             self.latent_prior(older),
-            self.settings.local_fit,
             self.streams.under("local dynamics", experience.iteration),
         )
         cost = self.fitted_cost(states)  # the quadratic cost of section 3

@@ -82,8 +82,8 @@ class Trainer:
                 raise Diverged(f"{place}: the loss is not finite")
             if pausing:
                 running["seconds"] += time.perf_counter() - last
-                last = time.perf_counter()
                 self.pulse(f"training the model ({name})", running["step"] / steps)
+                last = time.perf_counter()  # a pulse may take its time to save
         self._running = self._optimiser = None
         model.prior.conclude(data.posterior(model))
         seconds = running["seconds"] + time.perf_counter() - last

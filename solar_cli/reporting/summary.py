@@ -16,6 +16,7 @@ from solar_cli.reporting.statistics import (
     typical_episodes,
 )
 from solar_cli.reporting.tables import Table, bounded, interval, number
+from solar_cli.reporting.timing import note, shares
 from solar_cli.store.records import State
 from solar_cli.store.store import Store
 from solar_cli.wording import counted
@@ -99,7 +100,10 @@ def summarise(
         seconds=sum(seed.record.seconds for seed in curve.seeds) / len(curve.seeds),
         memory_bytes=max(peaks, default=None),
         codes=tuple(codes(store, curve)),
-        notes=tuple(notes(store, curve, present)),
+        notes=(
+            *notes(store, curve, present),
+            *note(curve.label, shares(store, [seed.record for seed in curve.seeds])),
+        ),
     )
 
 

@@ -22,7 +22,7 @@ COMMANDS = sorted(command.name for command in cli.app.registered_commands if com
 
 def test_the_commands_are_those_of_the_design() -> None:
     named = {"run", "status", "show", "report", "compare", "tasks", "methods", "export", "rm"}
-    assert set(COMMANDS) == named | {"doctor"}
+    assert set(COMMANDS) == named | {"diagnose", "doctor"}
 
 
 def examples(text: str) -> list[str]:

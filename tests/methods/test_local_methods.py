@@ -10,7 +10,7 @@ from method_runs import Run
 from solar_cli.control import trust_region
 from solar_cli.envs import build_task
 from solar_cli.episodes import Evaluation, Experience, evaluate
-from solar_cli.methods import Diverged, solar
+from solar_cli.methods import Diverged, local, solar
 from solar_cli.streams import Streams
 
 both = pytest.mark.parametrize("name", ["solar", "vae"])
@@ -18,8 +18,9 @@ both = pytest.mark.parametrize("name", ["solar", "vae"])
 
 def spied(monkeypatch, name):
     """Arguments of every call of a function of Algorithm 1's page."""
-    calls, function = [], getattr(solar, name)
-    monkeypatch.setattr(solar, name, lambda *given: calls.append(given) or function(*given))
+    page = local if hasattr(local, name) else solar
+    calls, function = [], getattr(page, name)
+    monkeypatch.setattr(page, name, lambda *given: calls.append(given) or function(*given))
     return calls
 
 
