@@ -26,6 +26,9 @@ from solar_cli.streams import Streams
 
 Floats = NDArray[np.float64]
 
+ARRAYS = ("frames", "actions", "action_means", "costs")
+"""what every file of episodes holds, by the names of `Episodes`"""
+
 
 class Policy(Protocol):
     """What acts. Noise is drawn when an episode starts, so that it may be smooth over time."""
@@ -51,6 +54,12 @@ class Episodes:
     """(N, T) of the state and the executed action of each step"""
     window: int = 1
     """frames an observation holds"""
+    lengths: NDArray[np.int64] = None  # type: ignore[assignment]
+    """(N,) live steps of each episode; T, the default, where nothing ended early"""
+
+    def __post_init__(self) -> None:
+        if self.lengths is None:
+            object.__setattr__(self, "lengths", np.full(len(self.frames), self.horizon))
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -60,6 +69,16 @@ class Episodes:
         """T: actions an episode has."""
         return int(self.actions.shape[1])
 
+    @property
+    def live_steps(self) -> NDArray[np.bool_]:
+        """(N, T) whether an episode was still running: nothing may be learned from other steps."""
+        return np.asarray(np.arange(self.horizon) < self.lengths[:, None])
+
+    @property
+    def live_frames(self) -> NDArray[np.bool_]:
+        """(N, T+1) the frames that live steps start from and lead to."""
+        return np.asarray(np.arange(self.horizon + 1) <= self.lengths[:, None])
+
     def __getitem__(self, rows: Any) -> Episodes:
         return Episodes(
             self.frames[rows],
@@ -67,6 +86,7 @@ class Episodes:
             self.action_means[rows],
             self.costs[rows],
             self.window,
+            self.lengths[rows],
         )
 
     @staticmethod
@@ -78,6 +98,7 @@ class Episodes:
             np.concatenate([part.action_means for part in parts]),
             np.concatenate([part.costs for part in parts]),
             parts[0].window,
+            np.concatenate([part.lengths for part in parts]),
         )
 
 
@@ -114,7 +135,10 @@ def roll_out(
     resets: Sequence[np.random.Generator],
     noise: np.random.Generator | None,
 ) -> Evaluation:
-    """Run one episode for each reset stream, all at once."""
+    """Run one episode for each reset stream, all at once.
+
+    In the steps after an episode's end no action is executed; they cost what the task says.
+    """
     count, horizon, window = len(resets), settings.horizon, settings.observation.window
     index = window_indices(horizon, window)
     first = task.reset(resets)
@@ -123,18 +147,21 @@ def roll_out(
     actions = np.empty((count, horizon, settings.action.size))
     means = np.empty_like(actions)
     costs = np.empty((count, horizon))
+    lengths = np.full(count, horizon)
     measures, truths = [_ground_truth(task)[0]], [_ground_truth(task)[1]]
     state = policy.start(count, noise)
     for t in range(horizon):
         wanted, means[:, t], state = policy.act(frames[:, index[t]], t, state)
         actions[:, t] = np.clip(wanted, -settings.action.bound, settings.action.bound)
         frames[:, t + 1], costs[:, t] = task.step(actions[:, t])
+        actions[lengths <= t, t] = means[lengths <= t, t] = 0.0
+        lengths[task.ended() & (lengths > t)] = t + 1
         measured, truth = _ground_truth(task)
         measures.append(measured)
         truths.append(truth)
     names = set(measures[0]).intersection(*measures)
     return Evaluation(
-        Episodes(frames, actions, means, costs, window),
+        Episodes(frames, actions, means, costs, window, lengths),
         {name: np.stack([step[name] for step in measures], axis=1) for name in sorted(names)},
         *_stacked(truths, task.truth_names),
     )
@@ -190,7 +217,7 @@ class Environment:
     @property
     def steps(self) -> int:
         """Actions executed so far."""
-        return self.episodes * self.settings.horizon
+        return sum(int(entry["steps"]) for entry in self._ledger)
 
     def begin(self, iteration: int) -> None:
         """Start, or start again, an iteration."""
@@ -248,7 +275,10 @@ class Environment:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Take up a ledger; the episodes are read when they are asked for."""
-        self._ledger = [dict(entry) for entry in state["ledger"]]
+        self._ledger = [
+            {"steps": entry["episodes"] * self.settings.horizon, **entry}  # older ones lack it
+            for entry in state["ledger"]
+        ]
         self._kept.clear()
 
     def _get(self, entry: Mapping[str, Any]) -> Episodes:
@@ -279,14 +309,12 @@ class Environment:
     def _store(self, key: tuple[int, int], noisy: bool, collected: Evaluation) -> dict[str, Any]:
         """Write the file whole or not at all, and describe it."""
         episodes = collected.episodes
+        arrays = {name: getattr(episodes, name) for name in ARRAYS}
+        live = episodes.live_steps
+        if not live.all():  # a file of whole episodes keeps the bits that it always had
+            arrays["lengths"] = episodes.lengths
         buffer = io.BytesIO()
-        np.savez_compressed(
-            buffer,
-            frames=episodes.frames,
-            actions=episodes.actions,
-            action_means=episodes.action_means,
-            costs=episodes.costs,
-        )
+        np.savez_compressed(buffer, allow_pickle=False, **arrays)
         data = buffer.getvalue()
         name = f"{key[0]:04d}-{key[1]}.npz"
         self._folder.mkdir(parents=True, exist_ok=True)
@@ -296,12 +324,13 @@ class Environment:
             file.flush()
             os.fsync(file.fileno())
         beside.replace(self._folder / name)
-        clipped = np.abs(episodes.actions) >= self.settings.action.bound
+        clipped = np.abs(episodes.actions[live]) >= self.settings.action.bound
         return {
             "iteration": key[0],
             "call": key[1],
             "noisy": noisy,
             "episodes": len(episodes),
+            "steps": int(episodes.lengths.sum()),
             "file": name,
             "sha256": hashlib.sha256(data).hexdigest(),
             "summary": {

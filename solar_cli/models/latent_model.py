@@ -75,9 +75,11 @@ class LatentModel:
         frames = torch.from_numpy(np.ascontiguousarray(episodes.frames)).to(device)
         mean, variance = self.embed(frames.flatten(0, 1))
         shape = (*frames.shape[:2], -1)
+        live = episodes.live_frames
         return Segments(
             mean.view(shape),
             variance.view(shape),
             torch.from_numpy(episodes.actions).to(device),
             torch.zeros(len(episodes), dtype=torch.long, device=device),
+            None if live.all() else torch.from_numpy(live).to(device),
         )

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple, Protocol
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from solar_cli.inference import mniw, niw
@@ -26,6 +26,14 @@ class Segments(NamedTuple):
     actions: Float[Tensor, "S L_1 a"]
     start: Int[Tensor, " S"]
     """time step of the first frame; 0 where an episode begins"""
+    live: Bool[Tensor, "S L"] | None = None
+    """the frames that count, the first ones of each segment; None where all do"""
+
+    def counted(self, part: Float[Tensor, "S n *rest"]) -> Float[Tensor, "k *rest"]:
+        """Of one value a frame, or a transition to one of the last n frames: those that count."""
+        if self.live is None:
+            return part.flatten(0, 1)
+        return part[self.live[:, self.live.shape[1] - part.shape[1] :]]
 
 
 class LatentPrior(NamedTuple):
@@ -75,7 +83,8 @@ class StandardNormal:
 
     def kl(self, segments: Segments) -> Tensor:
         """KL(N(mean, variance) || N(0, I)), nats a frame."""
-        return standard_normal_kl(segments.mean, segments.variance).mean()
+        kl = standard_normal_kl(segments.mean, segments.variance)
+        return segments.counted(kl).mean()
 
     def learn(self, segments: Segments, weights: tuple[float, float]) -> None:
         """Nothing to learn."""
@@ -181,6 +190,7 @@ class LinearDynamics:
             times = self._times(segments)
             expected = mniw.ExpectedStatistics(*(part[times] for part in expected))
         transition = mniw.expected_transition_kl(expected, y, y_variance, x, x_variance)
+        transition = segments.counted(transition)
         first = segments.start == 0
         initial = niw.expected_initial_kl(
             niw.standard(self.initial), segments.mean[first, 0], segments.variance[first, 0]
@@ -192,14 +202,14 @@ class LinearDynamics:
     ) -> tuple[mniw.RegressionStatistics, mniw.RegressionStatistics]:
         x, x_variance, y, y_variance = self._transitions(segments)
         if self.settings.factors == "shared":
-            flat = [part.flatten(0, 1) for part in (x, y, x_variance, y_variance)]
+            flat = [segments.counted(part) for part in (x, y, x_variance, y_variance)]
             transitions = mniw.regression_statistics(*flat)
         else:
             # One "sample axis" of length 1 a transition, then summed by time step.
             single = mniw.regression_statistics(
-                *(part.flatten(0, 1)[:, None] for part in (x, y, x_variance, y_variance))
+                *(segments.counted(part)[:, None] for part in (x, y, x_variance, y_variance))
             )
-            times = self._times(segments).flatten()
+            times = segments.counted(self._times(segments))
             transitions = mniw.RegressionStatistics(
                 *(
                     torch.zeros_like(p).index_add(0, times, s)

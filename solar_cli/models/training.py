@@ -12,9 +12,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from solar_cli.episodes import Episodes
+from solar_cli.errors import SolarError
 from solar_cli.models.latent_model import LatentModel, Minibatch
 from solar_cli.models.priors import Segments
 from solar_cli.pulse import Diverged, Pulse
@@ -103,7 +105,8 @@ class Trainer:
         torch.autograd.backward(loss)
         torch.nn.utils.clip_grad_norm_(model.networks.parameters(), self.settings.clip)
         optimiser.step()
-        model.prior.learn(Segments(*(part.detach() for part in segments)), weights)
+        mean, variance = segments.mean.detach(), segments.variance.detach()
+        model.prior.learn(segments._replace(mean=mean, variance=variance), weights)
         return loss.detach(), terms
 
     def _rate(self, share: float, fine_tuning: bool) -> float:
@@ -148,12 +151,21 @@ class Trainer:
 
 
 class Dataset:
-    """Batches of episodes on the device, and minibatches of segments from them."""
+    """Batches of episodes on the device, and minibatches of segments from them.
+
+    Segments are of live steps only; an episode that ended before it was as long as one has none.
+    """
 
     def __init__(self, batches: list[Episodes], device: str) -> None:
         self.device = device
         self.episodes = Episodes.joined(batches)
         self.newest = len(batches[-1])
+        if (longest := self.episodes.lengths.max()) < self.episodes.window:
+            raise SolarError(
+                f"none of {len(self.episodes)} episodes lasts longer than {longest} steps: there "
+                f"is no transition between windows of {self.episodes.window} frames to learn from; "
+                "choose a smaller window, or exploration that ends episodes later"
+            )
         self.frames = torch.from_numpy(self.episodes.frames).to(device)
         self.actions = torch.from_numpy(self.episodes.actions).to(device)
 
@@ -161,14 +173,18 @@ class Dataset:
         self, settings: Training, stream: np.random.Generator, latent: int, favour_newest: bool
     ) -> Minibatch:
         """Random segments; with ``favour_newest`` half of them from the newest batch."""
-        count, frames = len(self.episodes), self.episodes.horizon + 1
-        length = min(settings.length, frames)
+        length = min(settings.length, int(self.episodes.lengths.max()) + 1)
         segments = settings.segments
-        rows = stream.integers(count, size=segments)
-        if favour_newest:
+        firsts = self._firsts(length)
+        # Each episode as often as it has segments, which are then equally likely.
+        often = firsts // np.gcd.reduce(firsts)
+        tickets = np.repeat(np.arange(len(firsts)), often)
+        drawn = stream.integers(len(tickets), size=segments)
+        if favour_newest and (newest := int(often[-self.newest :].sum())):
             half = segments // 2
-            rows[:half] = count - 1 - stream.integers(self.newest, size=half)
-        starts = stream.integers(frames - length + 1, size=segments)
+            drawn[:half] = len(tickets) - 1 - stream.integers(newest, size=half)
+        rows = tickets[drawn]
+        starts = stream.integers(firsts[rows])
         noise = stream.standard_normal((segments, length, latent), dtype=np.float32)
         decoded = stream.permutation(segments * length)
         decoded = decoded[: max(1, round(settings.decoded * segments * length))]
@@ -186,13 +202,18 @@ class Dataset:
     def weights(self, batch: Minibatch) -> tuple[float, float]:
         """B of Eq. 6: how many times a minibatch goes into the data, by transitions and by starts.
 
-        L frames hold L - W transitions between windows of W; a segment starts an episode with
-        probability 1 / (T - L + 2).
+        L frames hold L - W transitions between windows of W; a segment starts one of the episodes
+        that have any as often as there are such episodes among all segments.
         """
         segments, length = batch.frames.shape[:2]
-        count, horizon, window = len(self.episodes), self.episodes.horizon, self.episodes.window
-        transitions = count * (horizon + 1 - window) / (segments * (length - window))
-        return transitions, count * (horizon - length + 2) / segments
+        firsts, window = self._firsts(length), self.episodes.window
+        transitions = np.maximum(self.episodes.lengths + 1 - window, 0).sum()
+        starts = len(firsts) * firsts.sum() / (np.count_nonzero(firsts) * segments)
+        return float(transitions / (segments * (length - window))), float(starts)
+
+    def _firsts(self, length: int) -> NDArray[np.int64]:
+        """(N,) segments of ``length`` frames that each episode has."""
+        return np.asarray(np.maximum(self.episodes.lengths + 2 - length, 0))
 
     def posterior(self, model: LatentModel) -> Segments:
         """q(z | s) of every episode."""
