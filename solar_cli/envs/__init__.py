@@ -18,7 +18,10 @@ from solar_cli.settings import TaskSettings
 
 __all__ = ["SIMULATORS", "Task", "build_task", "picture"]
 
-SIMULATORS = {"navigation": "solar_cli.envs.navigation"}
+SIMULATORS = {
+    "gymnasium": "solar_cli.envs.gymnasium_task",
+    "navigation": "solar_cli.envs.navigation",
+}
 """name on a card -> module, imported when used"""
 
 

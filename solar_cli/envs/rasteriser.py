@@ -45,6 +45,19 @@ def _profiles(
     return first, np.exp(offsets * offsets * (-0.5 / deviation**2))
 
 
+def shrink(images: NDArray[np.float64], rows: int, columns: int) -> NDArray[np.float64]:
+    """Images (..., H, W) as (..., rows, columns): each pixel is the mean of the area it covers."""
+    down, across = _areas(images.shape[-2], rows), _areas(images.shape[-1], columns)
+    return np.asarray(down @ images @ across.T)
+
+
+def _areas(size: int, pixels: int) -> NDArray[np.float64]:
+    """(pixels, size) share of each old pixel in each new one; each row sums to one."""
+    edges, old = np.arange(pixels + 1)[:, None] * size / pixels, np.arange(size)
+    covered = np.minimum(edges[1:], old + 1) - np.maximum(edges[:-1], old)
+    return np.asarray(np.maximum(covered, 0.0) * pixels / size)
+
+
 def enlarge(images: NDArray[np.float64], factor: int) -> NDArray[np.float64]:
     """Images (..., H, W) at ``factor`` times the resolution, (..., H factor, W factor).
 

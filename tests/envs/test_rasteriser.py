@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from solar_cli.envs.rasteriser import draw_blobs, enlarge
+from solar_cli.envs.rasteriser import draw_blobs, enlarge, shrink
 
 
 def drawn(centres, deviation=1.0, shape=(32, 32)):
@@ -76,3 +76,12 @@ def test_enlarging_keeps_constants_and_ramps():
 def test_enlarging_keeps_the_pixels_at_their_centres():
     image = np.random.default_rng(3).uniform(size=(7, 9))
     assert enlarge(image, 3)[1::3, 1::3] == pytest.approx(image)
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(6, 4), (3, 2), (4, 3), (7, 9), (1, 1)])
+def test_a_shrunk_image_keeps_the_light_of_every_area(rows, columns):
+    """Enlarged by repetition to a common size, old and new pixels that cover it alike agree."""
+    image = np.random.default_rng(0).uniform(size=(2, 6, 4))
+    fine = image.repeat(rows, axis=1).repeat(columns, axis=2)
+    expected = fine.reshape(2, rows, 6, columns, 4).mean(axis=(2, 4))
+    np.testing.assert_allclose(shrink(image, rows, columns), expected, atol=1e-12)
