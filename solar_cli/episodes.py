@@ -29,6 +29,9 @@ Floats = NDArray[np.float64]
 HELD = 8
 """batches of frames held in memory: more than a local method at its defaults asks for in a turn"""
 
+ARRAYS = ("frames", "actions", "action_means", "costs")
+"""what every file of episodes holds, by the names of `Episodes`"""
+
 
 class Policy(Protocol):
     """What acts. Noise is drawn when an episode starts, so that it may be smooth over time."""
@@ -58,6 +61,12 @@ class Episodes:
     """(N, T) of the state and the executed action of each step"""
     window: int = 1
     """frames an observation holds"""
+    lengths: NDArray[np.int64] = None  # type: ignore[assignment]
+    """(N,) live steps of each episode; T, the default, where nothing ended early"""
+
+    def __post_init__(self) -> None:
+        if self.lengths is None:
+            object.__setattr__(self, "lengths", np.full(len(self.frames), self.horizon))
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -67,6 +76,16 @@ class Episodes:
         """T: actions an episode has."""
         return int(self.actions.shape[1])
 
+    @property
+    def live_steps(self) -> NDArray[np.bool_]:
+        """(N, T) whether an episode was still running: nothing may be learned from other steps."""
+        return np.asarray(np.arange(self.horizon) < self.lengths[:, None])
+
+    @property
+    def live_frames(self) -> NDArray[np.bool_]:
+        """(N, T+1) the frames that live steps start from and lead to."""
+        return np.asarray(np.arange(self.horizon + 1) <= self.lengths[:, None])
+
     def __getitem__(self, rows: Any) -> Episodes:
         return Episodes(
             self.frames[rows],
@@ -74,6 +93,7 @@ class Episodes:
             self.action_means[rows],
             self.costs[rows],
             self.window,
+            self.lengths[rows],
         )
 
     @staticmethod
@@ -85,6 +105,7 @@ class Episodes:
             np.concatenate([part.action_means for part in parts]),
             np.concatenate([part.costs for part in parts]),
             parts[0].window,
+            np.concatenate([part.lengths for part in parts]),
         )
 
 
@@ -151,7 +172,10 @@ def _run(
     resets: Sequence[np.random.Generator],
     noise: np.random.Generator | None,
 ) -> Evaluation:
-    """Run one episode for each reset stream, all at once."""
+    """Run one episode for each reset stream, all at once.
+
+    In the steps after an episode's end no action is executed; they cost what the task says.
+    """
     count, horizon, window = len(resets), settings.horizon, settings.observation.window
     index = window_indices(horizon, window)
     first = task.reset(resets)
@@ -160,18 +184,21 @@ def _run(
     actions = np.empty((count, horizon, settings.action.size))
     means = np.empty_like(actions)
     costs = np.empty((count, horizon))
+    lengths = np.full(count, horizon)
     measures, truths = [_ground_truth(task)[0]], [_ground_truth(task)[1]]
     state = policy.start(count, noise)
     for t in range(horizon):
         wanted, means[:, t], state = policy.act(frames[:, index[t]], t, state)
         actions[:, t] = np.clip(wanted, -settings.action.bound, settings.action.bound)
         frames[:, t + 1], costs[:, t] = task.step(actions[:, t])
+        actions[lengths <= t, t] = means[lengths <= t, t] = 0.0
+        lengths[task.ended() & (lengths > t)] = t + 1
         measured, truth = _ground_truth(task)
         measures.append(measured)
         truths.append(truth)
     names = set(measures[0]).intersection(*measures)
     return Evaluation(
-        Episodes(frames, actions, means, costs, window),
+        Episodes(frames, actions, means, costs, window, lengths),
         {name: np.stack([step[name] for step in measures], axis=1) for name in sorted(names)},
         *_stacked(truths, count, task.truth_names),
     )
@@ -229,7 +256,7 @@ class Environment:
     @property
     def steps(self) -> int:
         """Actions executed so far."""
-        return self.episodes * self.settings.horizon
+        return sum(int(entry["steps"]) for entry in self._ledger)
 
     def begin(self, iteration: int) -> None:
         """Start, or start again, an iteration."""
@@ -289,7 +316,10 @@ class Environment:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Take up a ledger; the episodes are read when they are asked for."""
-        self._ledger = [dict(entry) for entry in state["ledger"]]
+        self._ledger = [
+            {"steps": entry["episodes"] * self.settings.horizon, **entry}  # older ones lack it
+            for entry in state["ledger"]
+        ]
         self._held.clear()
 
     def _get(self, entry: Mapping[str, Any]) -> Episodes:
@@ -327,12 +357,14 @@ class Environment:
         self, key: tuple[int, int], noisy: bool, collected: Evaluation, data: bytes
     ) -> dict[str, Any]:
         """The ledger's entry of episodes whose file holds ``data``."""
-        clipped = np.abs(collected.episodes.actions) >= self.settings.action.bound
+        episodes = collected.episodes
+        clipped = np.abs(episodes.actions[episodes.live_steps]) >= self.settings.action.bound
         return {
             "iteration": key[0],
             "call": key[1],
             "noisy": noisy,
-            "episodes": len(collected.episodes),
+            "episodes": len(episodes),
+            "steps": int(episodes.lengths.sum()),
             "file": f"{key[0]:04d}-{key[1]}.npz",
             "sha256": hashlib.sha256(data).hexdigest(),
             "summary": {
@@ -354,14 +386,11 @@ class Environment:
 
 def _packed(episodes: Episodes) -> bytes:
     """What the file of these episodes holds; equal episodes give equal bytes."""
+    arrays = {name: getattr(episodes, name) for name in ARRAYS}
+    if not episodes.live_steps.all():  # a file of whole episodes keeps the bits that it always had
+        arrays["lengths"] = episodes.lengths
     buffer = io.BytesIO()
-    np.savez_compressed(
-        buffer,
-        frames=episodes.frames,
-        actions=episodes.actions,
-        action_means=episodes.action_means,
-        costs=episodes.costs,
-    )
+    np.savez_compressed(buffer, allow_pickle=False, **arrays)
     return buffer.getvalue()
 
 

@@ -49,11 +49,34 @@ class Sums:
         self.step_number += 1
         return self.frames(), costs
 
+    def ended(self):
+        return np.zeros(len(self.x), np.bool_)
+
     def measures(self):
         return {"place": self.x.copy(), "square": self.x**2}
 
     def truth(self):
         return self.x[:, None].copy()
+
+
+class Ending(Sums):
+    """Episodes end where the sum leaves [0, 1]; it stays there, and a step then costs 7."""
+
+    def reset(self, streams):
+        frames = super().reset(streams)
+        self.over = np.zeros(len(self.x), np.bool_)
+        self.last = frames
+        return frames
+
+    def step(self, actions):
+        over = self.over.copy()
+        frames, costs = super().step(np.where(over[:, None], 0.0, actions))
+        self.over |= (self.x < 0.0) | (self.x > 1.0)
+        self.last = np.where(over[:, None], self.last, frames)
+        return self.last.copy(), np.where(over, 7.0, costs)
+
+    def ended(self):
+        return self.over.copy()
 
 
 class Failing(Sums):
@@ -121,7 +144,7 @@ def files(environment: Environment) -> list[Path]:
 
 
 def assert_equal_bits(a: Episodes, b: Episodes) -> None:
-    for name in ("frames", "actions", "action_means", "costs"):
+    for name in ("frames", "actions", "action_means", "costs", "lengths"):
         left, right = getattr(a, name), getattr(b, name)
         assert left.dtype == right.dtype, name
         assert left.shape == right.shape, name
@@ -214,6 +237,82 @@ def test_joined_batches_keep_the_order_of_their_episodes(environment: Environmen
     assert joined.horizon == T
     assert_equal_bits(joined[:2], parts[0])
     assert_equal_bits(joined[2:], parts[1])
+
+
+# What ends early
+
+
+@pytest.fixture
+def ending(settings: TaskSettings, tmp_path: Path) -> Environment:
+    return Environment(Ending(), settings, Streams(1), tmp_path / "ending")
+
+
+def test_an_episode_is_as_long_as_its_task_says(ending: Environment):
+    ending.begin(1)
+    found = ending.collect(Pull(gain=0.0, std=0.4), 40)
+    x = found.frames[..., 0]
+    outside = (x < 0.0) | (x > 1.0)
+    expected = np.where(outside.any(axis=1), outside.argmax(axis=1), T)
+    np.testing.assert_array_equal(found.lengths, expected)
+    assert {1, T} < set(expected.tolist())
+    for episode, length in enumerate(found.lengths.tolist()):
+        assert found.live_steps[episode].tolist() == [t < length for t in range(T)]
+        assert found.live_frames[episode].tolist() == [t <= length for t in range(T + 1)]
+        np.testing.assert_array_equal(
+            found.frames[episode, length:],
+            np.broadcast_to(found.frames[episode, length], (T + 1 - length, 2)),
+        )
+    assert (found.costs[~found.live_steps] == 7.0).all()
+    assert not found.actions[~found.live_steps].any()
+    assert not found.action_means[~found.live_steps].any()
+    assert found.actions[found.live_steps].all()
+
+
+def test_live_steps_are_those_of_a_task_that_goes_on(ending: Environment, environment: Environment):
+    batches = []
+    for one in (ending, environment):
+        one.begin(1)
+        batches.append(one.collect(Pull(gain=0.0, std=0.4), 40))
+    for name in ("actions", "action_means", "costs"):
+        left, right = (getattr(batch, name)[batches[0].live_steps] for batch in batches)
+        np.testing.assert_array_equal(left, right)
+
+
+def test_lengths_survive_their_file_and_go_where_episodes_go(ending: Environment):
+    ending.begin(1)
+    parts = [ending.collect(Pull(gain=0.0, std=0.4), count) for count in (20, 10)]
+    fresh = again(ending, 1)
+    fresh._task = Ending()
+    assert_equal_bits(fresh.collected(1), Episodes.joined(parts))
+    rows = np.array([25, 3])
+    joined = Episodes.joined(parts)
+    np.testing.assert_array_equal(joined[rows].lengths, [parts[1].lengths[5], parts[0].lengths[3]])
+
+
+def test_only_executed_actions_are_counted(ending: Environment):
+    ending.begin(1)
+    found = ending.collect(Pull(gain=0.0, std=0.4), 40)
+    assert ending.steps == found.lengths.sum() < 40 * T
+    clipped = np.abs(found.actions[found.live_steps]) == BOUND
+    assert ending.summary(1)["clipped"] == pytest.approx(clipped.mean(), rel=1e-12)
+    assert ending.summary(1)["return"] == pytest.approx(-found.costs.sum(axis=1).mean(), rel=1e-12)
+
+
+def test_a_file_of_whole_episodes_holds_what_it_always_held(environment: Environment):
+    environment.begin(1)
+    environment.collect(Pull(), 2)
+    with np.load(files(environment)[0]) as arrays:
+        assert set(arrays) == {"frames", "actions", "action_means", "costs"}
+
+
+def test_a_ledger_without_steps_is_of_whole_episodes(environment: Environment):
+    environment.begin(1)
+    environment.collect(Pull(), 3)
+    state = environment.state_dict()
+    for entry in state["ledger"]:
+        del entry["steps"]
+    environment.load_state_dict(state)
+    assert environment.steps == 3 * T
 
 
 # What counts

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from solar_cli.control.linear_gaussian import QuadraticCost
@@ -93,26 +93,27 @@ def fit_quadratic_cost(
     The cost of the last state, which is never observed, is the last fit's times
     ``settings.terminal``.
     """
-    z = states.z[:, :-1, :features]
+    z, live = states.z[:, :-1, :features], states.live
     y = states.costs - action_cost * states.actions.square().sum(dim=-1)
-    scale = y.std().clamp_min(1e-9)
-    target = (y - y.mean()) / scale
+    mean, scale = y[live].mean(), y[live].std().clamp_min(1e-9)
+    target = (y - mean) / scale
     held_out = torch.arange(len(z)) % 5 == 4
     if len(z) < 5:
         held_out = torch.arange(len(z)) == len(z) - 1
     fit, judge = ~held_out, held_out
-    shared = _fit_shared(z[fit], target[fit], settings)
-    r2 = _r2(shared.value(z[judge].flatten(0, 1)), target[judge].flatten())
+    shared = _fit_shared(z[fit], target[fit], live[fit], settings)
+    judged, observed = live[judge], target[judge][live[judge]]
+    r2 = _r2(shared.value(z[judge][judged]), observed)
     per_time = False
     if settings.per_time == "chosen":
-        each = _fit_each(z[fit], target[fit], shared, settings)
+        each = _fit_each(z[fit], target[fit], live[fit], shared, settings)
         predicted = each.value(z[judge].transpose(0, 1)).transpose(0, 1)
-        each_r2 = _r2(predicted.flatten(), target[judge].flatten())
+        each_r2 = _r2(predicted[judged], observed)
         per_time, r2 = each_r2 > r2, max(r2, each_r2)
-    best = _fit_shared(z, target, settings)
+    best = _fit_shared(z, target, live, settings)
     if per_time:
-        best = _fit_each(z, target, best, settings)
-    model = _assembled(best, states, action_cost, y.mean(), scale, settings.terminal)
+        best = _fit_each(z, target, live, best, settings)
+    model = _assembled(best, states, action_cost, mean, scale, settings.terminal)
     return FittedCost(model, r2, per_time)
 
 
@@ -121,7 +122,7 @@ def explained(model: QuadraticCost, states: Trajectories) -> float:
     x = torch.cat([states.z[:, :-1], states.actions], dim=-1)
     quadratic = 0.5 * torch.einsum("nti,tij,ntj->nt", x, model.C[:-1], x)
     predicted = quadratic + torch.einsum("nti,ti->nt", x, model.c[:-1]) + model.b[:-1]
-    return _r2(predicted, states.costs)
+    return _r2(predicted[states.live], states.costs[states.live])
 
 
 def _r2(predicted: Tensor, observed: Tensor) -> float:
@@ -131,15 +132,22 @@ def _r2(predicted: Tensor, observed: Tensor) -> float:
     return float(1 - residual / spread) if spread > 1e-18 else 1.0
 
 
-def _moments(z: Float[Tensor, "N T m"], target: Float[Tensor, "N T"]) -> _Moments:
-    """Means over the episodes, for every time step."""
-    x, y = _monomials(z.transpose(0, 1)), target.T.unsqueeze(-1)
-    count = len(z)
-    return _Moments(x.mT @ x / count, (x.mT @ y).squeeze(-1) / count, target.square().mean(dim=0))
+def _moments(
+    z: Float[Tensor, "N T m"], target: Float[Tensor, "N T"], live: Bool[Tensor, "N T"]
+) -> _Moments:
+    """Sums over the episodes that were still running, over N, for every time step."""
+    over, count = ~live.T, len(z)
+    x = _monomials(z.transpose(0, 1)).masked_fill(over.unsqueeze(-1), 0.0)
+    y = target.T.masked_fill(over, 0.0)
+    xy = (x.mT @ y.unsqueeze(-1)).squeeze(-1)
+    return _Moments(x.mT @ x / count, xy / count, y.square().mean(dim=1))
 
 
 def _fit_shared(
-    z: Float[Tensor, "N T m"], target: Float[Tensor, "N T"], settings: CostFit
+    z: Float[Tensor, "N T m"],
+    target: Float[Tensor, "N T"],
+    live: Bool[Tensor, "N T"],
+    settings: CostFit,
 ) -> _Quadratic:
     m = z.shape[-1]
     start = _Quadratic(
@@ -147,24 +155,30 @@ def _fit_shared(
         torch.zeros(m, dtype=z.dtype, device=z.device),
         torch.zeros((), dtype=z.dtype, device=z.device),
     )
-    moments = _Moments(*(part.mean(dim=0) for part in _moments(z, target)))
+    share = live.to(z).mean()
+    moments = _Moments(*(part.mean(dim=0) / share for part in _moments(z, target, live)))
     return _minimise(start, moments.error, settings)
 
 
 def _fit_each(
     z: Float[Tensor, "N T m"],
     target: Float[Tensor, "N T"],
+    live: Bool[Tensor, "N T"],
     shared: _Quadratic,
     settings: CostFit,
 ) -> _Quadratic:
-    """One fit a time step; samples of neighbouring steps count with a Gaussian weight."""
+    """One fit a time step; samples of neighbouring steps count with a Gaussian weight.
+
+    A time step far from all samples gets the shared fit.
+    """
     horizon = z.shape[1]
     times = torch.arange(horizon, device=z.device)
     distance = (times[:, None] - times).abs()
     reach = max(1, round(2 * settings.width))
     weight = torch.exp(-0.5 * (distance / settings.width).square()) * (distance <= reach)
-    weight = (weight / weight.sum(dim=1, keepdim=True)).to(z.dtype)
-    own = _moments(z, target)
+    total = (weight * live.to(weight).mean(dim=0)).sum(dim=1, keepdim=True)
+    weight = (weight / torch.where(total > 0, total, 1.0)).to(z.dtype)
+    own = _moments(z, target, live)
     moments = _Moments(*(torch.einsum("ts,s...->t...", weight, part) for part in own))
     start = _Quadratic(*(part.expand(horizon, *part.shape).clone() for part in shared))
 

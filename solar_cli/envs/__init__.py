@@ -19,6 +19,7 @@ from solar_cli.settings import TaskSettings
 __all__ = ["SIMULATORS", "Task", "build_task", "picture"]
 
 SIMULATORS = {
+    "gymnasium": "solar_cli.envs.gymnasium_task",
     "navigation": "solar_cli.envs.navigation",
     "car": "solar_cli.envs.car",
     "reacher": "solar_cli.envs.reacher",

@@ -29,10 +29,10 @@ def load_mujoco() -> Any:
         import mujoco
     except ModuleNotFoundError as error:
         if error.name != "mujoco":
-            raise _cannot_draw(error) from error
+            raise cannot_draw(error) from error
         raise UsageError("the package mujoco is missing here: pip install mujoco") from error
     except Exception as error:  # a graphics library that is not there shows in many ways
-        raise _cannot_draw(error) from error
+        raise cannot_draw(error) from error
     return mujoco
 
 
@@ -49,13 +49,14 @@ def make_renderer(model: Any, height: int, width: int) -> Any:
             warnings.filterwarnings("error", module="glfw")
             renderer = mujoco.Renderer(model, height, width, MOST_GEOMS)
     except Exception as error:
-        raise _cannot_draw(error) from error
+        raise cannot_draw(error) from error
     # Handlers run last in, first out: before the one by which MuJoCo has just arranged to end EGL.
     atexit.register(renderer.close)
     return renderer
 
 
-def _cannot_draw(error: Exception) -> UsageError:
+def cannot_draw(error: Exception) -> UsageError:
+    """What is wrong with the graphics library, and what to install."""
     cause = " ".join(f"{type(error).__name__}: {error}".split())
     return UsageError(
         f"MuJoCo cannot draw here, MUJOCO_GL is {os.environ.get('MUJOCO_GL') or 'not set'} "

@@ -163,6 +163,19 @@ def _overlap(places: Floats, half: float) -> Floats:
     return np.minimum(np.maximum(half + 0.5 - np.abs(places), 0.0), min(1.0, 2.0 * half))
 
 
+def shrink(images: Floats, rows: int, columns: int) -> Floats:
+    """Images (..., H, W) as (..., rows, columns): each pixel is the mean of the area it covers."""
+    down, across = _areas(images.shape[-2], rows), _areas(images.shape[-1], columns)
+    return np.asarray(down @ images @ across.T)
+
+
+def _areas(size: int, pixels: int) -> Floats:
+    """(pixels, size) share of each old pixel in each new one; each row sums to one."""
+    edges, old = np.arange(pixels + 1)[:, None] * size / pixels, np.arange(size)
+    covered = np.minimum(edges[1:], old + 1) - np.maximum(edges[:-1], old)
+    return np.asarray(np.maximum(covered, 0.0) * pixels / size)
+
+
 def enlarge(images: Floats, factor: int) -> Floats:
     """Images (..., H, W) at ``factor`` times the resolution, (..., H factor, W factor).
 

@@ -39,8 +39,12 @@ class Task(Protocol):
     def step(self, actions: Floats) -> tuple[Frames, Floats]:
         """Execute actions (N, a): the next frames, and the costs (N,) of state and action.
 
-        The cost is that of the state before the step and of the action after clipping.
+        The cost is that of the state before the step and of the action after clipping. An episode
+        that is over stays at its last frame; what such a step costs is the task's to say.
         """
+
+    def ended(self) -> NDArray[np.bool_]:
+        """Which episodes (N,) are over before the horizon."""
 
     def measures(self) -> dict[str, Floats]:
         """Ground truth of the current states, (N,) each; to judge a policy, never to learn from."""
@@ -119,6 +123,10 @@ class RowTask:
         self._rows = self._simulator.dynamics(self._rows, executed)
         return self._simulator.draw(self._rows, self._scenes), costs
 
+    def ended(self) -> NDArray[np.bool_]:
+        """As `Task.ended`: none."""
+        return np.zeros(len(self._rows), np.bool_)
+
     def measures(self) -> dict[str, Floats]:
         """As `Task.measures`."""
         return self._simulator.measures(self._rows)
@@ -138,6 +146,9 @@ class Simulation(Protocol):
 
     def step(self, action: Floats) -> tuple[Frames, float]:
         """Execute an action (a,) within its bounds: the next frame, and the cost as in `Task`."""
+
+    def ended(self) -> bool:
+        """As `Task.ended`, of this episode."""
 
     def measures(self) -> dict[str, float]:
         """As `Task.measures`, of this episode."""
@@ -177,6 +188,10 @@ class LoopTask:
         executed = _executed(actions, len(self._running), self)
         stepped = [one.step(action) for one, action in zip(self._running, executed, strict=True)]
         return np.stack([frame for frame, _ in stepped]), np.array([cost for _, cost in stepped])
+
+    def ended(self) -> NDArray[np.bool_]:
+        """As `Task.ended`."""
+        return np.array([one.ended() for one in self._running])
 
     def measures(self) -> dict[str, Floats]:
         """As `Task.measures`."""

@@ -195,7 +195,7 @@ class Privileged(LocalLearner):
         """The policy that collected that iteration, batch by batch: frames fill the memory."""
         policy, size = self._tried[iteration], self.settings.batches.noisy
         batches = [
-            self.embedded(self.world.roll_out(policy, size, iteration, number))
+            self.embedded(self.world.roll_out(policy, size, iteration, number), [])[0]
             for number in range(ROLLOUTS)
         ]
         return Trajectories(*(torch.cat(parts) for parts in zip(*batches, strict=True)))

@@ -98,12 +98,12 @@ class LocalLearner(ABC):
         floor = early if self.updates < update.early_updates else later
         return floor * std, update.std_ceiling * std
 
-    def max_kl(self, region: TrustRegion) -> float | None:
-        """Nats that the trajectory distribution may move; None without a bound."""
+    def max_kl(self, region: TrustRegion, steps: int) -> float | None:
+        """Nats that the distribution over ``steps`` time steps may move; None without a bound."""
         step = self.settings.update.kl_step
         if isinstance(step, str):
             return None
-        return step * self.task.horizon * region.step.multiplier
+        return step * steps * region.step.multiplier
 
     def collect(self, experience: Experience) -> Anchor:
         """Line 4: episodes of the current policy, judged without noise where the card says so."""
@@ -126,9 +126,18 @@ class LocalLearner(ABC):
         others = others[: self.settings.local_fit.older_batches]
         return experience.collected(chosen), [experience.collected(i) for i in others]
 
-    def embedded(self, episodes: Episodes) -> Trajectories:
-        """Latent states of episodes, on the CPU: control runs there."""
-        return Trajectories.of(self.representation.embed(episodes).cpu(), episodes)
+    def embedded(
+        self, episodes: Episodes, older: list[Episodes]
+    ) -> tuple[Trajectories, list[Trajectories]]:
+        """Latent states of episodes, on the CPU: control runs there.
+
+        Where episodes ended early, only of the time steps that there is something to plan by.
+        """
+        newest, *others = (
+            Trajectories.of(self.representation.embed(batch).cpu(), batch)
+            for batch in (episodes, *older)
+        )
+        return newest.until(newest.planned), [batch.until(newest.planned) for batch in others]
 
     def latent_prior(self, older: list[Episodes]) -> LatentPrior:
         """What the model knows of its dynamics: a source of the prior of line 7."""
@@ -141,9 +150,10 @@ class LocalLearner(ABC):
         It acted on the latents from before its iteration's update: that one or a later one may have
         changed them.
         """
-        iteration, gains = region.built_upon.iteration, region.built_upon.gains
+        iteration = region.built_upon.iteration
+        gains = region.built_upon.gains.until(states.live.shape[1])
         if self.representation.moved_in >= iteration and self.settings.update.linearise:
-            return linearise_policy(states.z[:, :-1], states.action_means, gains)
+            return linearise_policy(states.z[:, :-1], states.action_means, states.live, gains)
         return Linearisation(gains, residual=0.0, ridge=0.0)
 
     def infer_dynamics(
@@ -168,13 +178,18 @@ class LocalLearner(ABC):
         previous: LinearGaussianPolicy,
         promised: float,
         update: PolicyUpdate,
+        reached: int,
     ) -> dict[str, float]:
-        """Make the update the policy to try next; metrics of the step."""
+        """Make the update the policy to try next; metrics of the step.
+
+        What few episodes ``reached`` is planned for, so that there is a future to act for; the
+        gains that act for it are those before, which go on.
+        """
         if not all(bool(torch.isfinite(part).all()) for part in update.policy):
             raise Diverged("the updated policy is not finite")
-        self.gains = update.policy
+        self.gains = update.policy.held(reached, self.task.horizon)
         trusted = self.settings.update.reject == "never" or region.trusts(promised)
-        self.handed = update.policy if trusted else previous
+        self.handed = self.gains if trusted else previous.held(reached, self.task.horizon)
         self.trust_region = replace(region, promised=promised)
         self.updates += 1
         stuck = update.outcome in (Outcome.NOT_POSITIVE_DEFINITE, Outcome.BRACKET_EXHAUSTED)
@@ -192,9 +207,9 @@ class LocalLearner(ABC):
         if not self.representation.trained or not evaluation.truth_names:
             return {}
         states = self.representation.embed(evaluation.episodes)[..., : self.latent]
-        latents = states.flatten(0, 1).cpu().numpy()
-        truth = evaluation.truth.reshape(len(latents), -1)
-        return latent_metrics(latents, truth, evaluation.truth_names)
+        live = evaluation.episodes.live_frames
+        latents = states.cpu().numpy()[live]
+        return latent_metrics(latents, evaluation.truth[live], evaluation.truth_names)
 
     def reconstruct(self, episodes: Episodes) -> NDArray[Any] | None:
         """Frames as the observation model expects them from the encoder's mean."""

@@ -30,7 +30,7 @@ class Solar(LocalLearner):
         episodes, older = self.batches(experience, region)
 
         model = self.representation.update(experience)  # line 5: MODELUPDATE, section 3
-        states, older_states = self.embedded(episodes), [self.embedded(batch) for batch in older]
+        states, older_states = self.embedded(episodes, older)
 
         previous = self.linearised(region, states)  # line 6: LINEARIZEPOLICY, appendix C
         dynamics = self.infer_dynamics(  # line 7: INFERDYNAMICS, section 4.1 and appendix B
@@ -40,8 +40,9 @@ class Solar(LocalLearner):
             self.streams.under("local dynamics", experience.iteration),
         )
         cost = self.fitted_cost(states)  # the quadratic cost of section 3
+        bound = self.max_kl(region, len(dynamics.model.F))
         update = improve_policy(  # line 8: POLICYUPDATE, section 4.2 and appendix A
-            previous.policy, dynamics.model, cost.model, self.max_kl(region), self.std_bounds()
+            previous.policy, dynamics.model, cost.model, bound, self.std_bounds()
         )
         promised = promised_fall(previous.policy, update.policy, dynamics.model, cost.model)
         return {
@@ -50,5 +51,5 @@ class Solar(LocalLearner):
             "cost_r2": cost.r2,
             "cost_per_time": float(cost.per_time),
             "linearisation_residual": previous.residual,
-            **self.adopt(region, previous.policy, promised, update),
+            **self.adopt(region, previous.policy, promised, update, states.reached),
         }

@@ -26,6 +26,8 @@ class Minibatch(NamedTuple):
     """standard normal draws for the sample of q(z | s)"""
     decoded: Tensor
     """numbers of the frames, of S L, that are decoded"""
+    starts: Tensor | None = None
+    """(S,) segments of this length that each one's episode has; None for a whole episode's"""
 
 
 class LatentModel:
@@ -50,7 +52,11 @@ class LatentModel:
         )
         shape = (*batch.frames.shape[:2], -1)
         segments = Segments(
-            mean.view(shape).double(), variance.view(shape).double(), batch.actions, batch.start
+            mean.view(shape).double(),
+            variance.view(shape).double(),
+            batch.actions,
+            batch.start,
+            starts=batch.starts,
         )
         statistics = self.prior.statistics(segments)
         kl = self.prior.kl(statistics)
@@ -75,9 +81,11 @@ class LatentModel:
         frames = torch.from_numpy(np.ascontiguousarray(episodes.frames)).to(device)
         mean, variance = self.embed(frames.flatten(0, 1))
         shape = (*frames.shape[:2], -1)
+        live = episodes.live_frames
         return Segments(
             mean.view(shape),
             variance.view(shape),
             torch.from_numpy(episodes.actions).to(device),
             torch.zeros(len(episodes), dtype=torch.long, device=device),
+            None if live.all() else torch.from_numpy(live).to(device),
         )

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple, Protocol
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from solar_cli.inference import mniw, niw
@@ -30,6 +30,16 @@ class Segments(NamedTuple):
     actions: Float[Tensor, "S L_1 a"]
     start: Int[Tensor, " S"]
     """time step of the first frame; 0 where an episode begins"""
+    live: Bool[Tensor, "S L"] | None = None
+    """the frames that count, the first ones of each segment; None where all do"""
+    starts: Int[Tensor, " S"] | None = None
+    """starts that a segment of each one's episode can have; None for a whole episode's T + 2 - L"""
+
+    def counted(self, part: Float[Tensor, "S n *rest"]) -> Float[Tensor, "k *rest"]:
+        """Of one value a frame, or a transition to one of the last n frames: those that count."""
+        if self.live is None:
+            return part.flatten(0, 1)
+        return part[self.live[:, self.live.shape[1] - part.shape[1] :]]
 
 
 class LatentPrior(NamedTuple):
@@ -85,7 +95,8 @@ class StandardNormal:
 
     def kl(self, statistics: Segments) -> Tensor:
         """KL(N(mean, variance) || N(0, I)), nats a frame."""
-        return standard_normal_kl(statistics.mean, statistics.variance).mean()
+        kl = standard_normal_kl(statistics.mean, statistics.variance)
+        return statistics.counted(kl).mean()
 
     def learn(self, statistics: Segments, scale: float) -> None:
         """Nothing to learn."""
@@ -180,8 +191,8 @@ class BayesianLDS:
 
     def statistics(self, segments: Segments) -> DynamicsStatistics:
         """Expected sufficient statistics, such that their mean over starts is an episode's."""
-        count, length = segments.mean.shape[:2]
-        times, weights, start_weights = self._weights(segments.start, length)
+        count = len(segments.start)
+        times, weights, start_weights = self._weights(segments)
         x, x_variance, y, y_variance = self._transitions(segments)
         logs = y_variance.log().sum(dim=-1)
         if self.settings.factors == "shared":
@@ -207,24 +218,29 @@ class BayesianLDS:
         starts = niw.initial_statistics(first, variance, start_weights)
         starts_log_variance = (start_weights * variance.log().sum(dim=-1)).sum()
         judged = count * (self.horizon + 2 - self.window)
+        if segments.live is not None:
+            judged = int(segments.live[:, self.window :].sum()) + count
         return DynamicsStatistics(transitions, log_variance, starts, starts_log_variance, judged)
 
     def _weights(
-        self, start: Int[Tensor, " S"], length: int
+        self, segments: Segments
     ) -> tuple[Int[Tensor, "S n"], Float[Tensor, "S n"], Float[Tensor, " S"]]:
         """Time step t of each transition z_t -> z_{t+1}, its weight, and the weight of each start.
 
         The weight is the number of starts a segment can have over that of those which reach t: the
-        inverse of the chance that a segment shows it.
+        inverse of the chance that a segment shows it. Every start of every episode has the same
+        chance; where episodes end early, theirs are counted.
         """
-        device = start.device
+        start, length = segments.start, segments.mean.shape[1]
         starts = self.horizon + 2 - length
-        every = torch.arange(self.horizon, device=device)
-        first = (every - length + 2).clamp_min(0)
-        last = (every - self.window + 1).clamp_max(starts - 1)
-        by_time = starts / (last - first + 1).clamp_min(1).double()
-        times = start[:, None] + torch.arange(self.window - 1, length - 1, device=device)
-        return times, by_time[times], starts * (start == 0).double()
+        own = torch.full_like(start, starts) if segments.starts is None else segments.starts
+        times = start[:, None] + torch.arange(self.window - 1, length - 1, device=start.device)
+        first = (times - length + 2).clamp_min(0)
+        last = torch.minimum(times - self.window + 1, own[:, None] - 1)
+        weights = starts / (last - first + 1).clamp_min(1).double()
+        if segments.live is not None:
+            weights = weights * segments.live[:, self.window :]
+        return times, weights, starts * (start == 0).double()
 
     def _transitions(self, segments: Segments) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """(x mean, x variance, y mean, y variance) of all transitions, (S, n, ...)."""

@@ -138,7 +138,7 @@ class Representation:
             attempt = len(self._candidates)
             if not self._trainer.under_way:
                 self._model = self._untrained(attempt)
-                self._model.networks.standardise_by(self._frames(learned))
+                self._model.networks.standardise_by(self._live_frames(learned))
             name = f"attempt {attempt}"
             terms = self._trainer.fit(name, self._model, [learned], training.steps)
             self._basis = self._whitening(learned)
@@ -198,9 +198,9 @@ class Representation:
         """What there is to watch, on collected episodes that the model has not been trained on."""
         model = self._model
         segments = self._posterior(episodes)
-        mean, variance = segments.mean.flatten(0, 1), segments.variance.flatten(0, 1)
+        mean, variance = segments.counted(segments.mean), segments.counted(segments.variance)
         some = slice(None, None, -(-len(mean) // JUDGED_FRAMES))
-        scaled = model.networks.scaled(self._frames(episodes)[some])
+        scaled = model.networks.scaled(self._live_frames(episodes)[some])
         draws = self._streams.generator("judging").standard_normal(mean[some].shape)
         sample = mean[some] + variance[some].sqrt() * torch.from_numpy(draws).to(mean)
         reconstruction = model.networks.reconstruction_loss(sample.float(), scaled)
@@ -230,7 +230,8 @@ class Representation:
     def reconstruct(self, episodes: Episodes) -> np.ndarray[Any, Any]:
         """Expected frames, in the shape and units of ``episodes.frames``."""
         networks = self._model.networks
-        scaled = networks.scaled(self._frames(episodes))
+        seen = torch.from_numpy(np.ascontiguousarray(episodes.frames))
+        scaled = networks.scaled(seen.flatten(0, 1).to(self.device))
         frames = networks.as_frames(networks.reconstruct(scaled))
         return frames.cpu().numpy().reshape(episodes.frames.shape)
 
@@ -265,9 +266,8 @@ class Representation:
     def _posterior(self, episodes: Episodes) -> Segments:
         return self._model.posterior(episodes, self.device)
 
-    def _frames(self, episodes: Episodes) -> Tensor:
-        frames = torch.from_numpy(np.ascontiguousarray(episodes.frames))
-        return frames.flatten(0, 1).to(self.device)
+    def _live_frames(self, episodes: Episodes) -> Float[Tensor, "n *frame"]:
+        return torch.from_numpy(episodes.frames[episodes.live_frames]).to(self.device)
 
     def _windows(self, latents: Float[Tensor, "N T1 d"]) -> Float[Tensor, "N T1 W d"]:
         """The newest frame first."""
@@ -275,8 +275,8 @@ class Representation:
         return latents[:, torch.from_numpy(index[:, ::-1].copy()).to(latents.device)]
 
     def _whitening(self, episodes: Episodes) -> LatentBasis:
-        mean = self._posterior(episodes).mean
-        return LatentBasis.whitening(self._windows(mean).flatten(0, 1))
+        segments = self._posterior(episodes)
+        return LatentBasis.whitening(segments.counted(self._windows(segments.mean)))
 
     def _parameters(self) -> dict[str, Any]:
         networks = {

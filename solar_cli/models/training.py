@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from solar_cli.episodes import Episodes
+from solar_cli.errors import SolarError
 from solar_cli.models.latent_model import LatentModel, Minibatch
 from solar_cli.models.priors import Segments
 from solar_cli.pulse import Diverged, Pulse
@@ -151,12 +152,21 @@ class Trainer:
 
 
 class Dataset:
-    """Batches of episodes on the device, and minibatches of segments from them."""
+    """Batches of episodes on the device, and minibatches of segments from them.
+
+    Segments are of live steps only; an episode that ended before it was as long as one has none.
+    """
 
     def __init__(self, batches: list[Episodes], device: str) -> None:
         self.device = device
         self.episodes = Episodes.joined(batches)
         self.newest = len(batches[-1])
+        if (longest := self.episodes.lengths.max()) < self.episodes.window:
+            raise SolarError(
+                f"none of {len(self.episodes)} episodes lasts longer than {longest} steps: there "
+                f"is no transition between windows of {self.episodes.window} frames to learn from; "
+                "choose a smaller window, or exploration that ends episodes later"
+            )
         self.frames = torch.from_numpy(self.episodes.frames).to(device).flatten(0, 1)
         self.actions = torch.from_numpy(self.episodes.actions).to(device).flatten(0, 1)
 
@@ -164,25 +174,31 @@ class Dataset:
         self, settings: Training, stream: np.random.Generator, latent: int, favour_newest: bool
     ) -> Minibatch:
         """Random segments; with ``favour_newest`` half of them from the newest batch."""
-        count, frames = len(self.episodes), self.episodes.horizon + 1
-        length = min(settings.length, frames)
+        length = min(settings.length, int(self.episodes.lengths.max()) + 1)
         segments = settings.segments
-        rows = stream.integers(count, size=segments)
-        if favour_newest:
+        firsts = self._firsts(length)
+        # Each episode as often as it has segments, which are then equally likely.
+        often = firsts // np.gcd.reduce(firsts)
+        tickets = np.repeat(np.arange(len(firsts)), often)
+        drawn = stream.integers(len(tickets), size=segments)
+        if favour_newest and (newest := int(often[-self.newest :].sum())):
             half = segments // 2
-            rows[:half] = count - 1 - stream.integers(self.newest, size=half)
-        starts = stream.integers(frames - length + 1, size=segments)
+            drawn[:half] = len(tickets) - 1 - stream.integers(newest, size=half)
+        rows = tickets[drawn]
+        starts = stream.integers(firsts[rows])
         noise = stream.standard_normal((segments, length, latent), dtype=np.float32)
         decoded = stream.permutation(segments * length)
         decoded = decoded[: max(1, round(settings.decoded * segments * length))]
-        places = (rows * frames + starts)[:, None] + np.arange(length)
-        moves = (rows * (frames - 1) + starts)[:, None] + np.arange(length - 1)
+        horizon = self.episodes.horizon
+        places = (rows * (horizon + 1) + starts)[:, None] + np.arange(length)
+        moves = (rows * horizon + starts)[:, None] + np.arange(length - 1)
         return Minibatch(
             self._taken(self.frames, places),
             self._taken(self.actions, moves),
             torch.from_numpy(starts).to(self.device),
             torch.from_numpy(noise).to(self.device),
             torch.from_numpy(decoded).to(self.device),
+            torch.from_numpy(firsts[rows]).to(self.device),
         )
 
     def _taken(self, flat: Tensor, places: NDArray[np.int64]) -> Tensor:
@@ -192,7 +208,13 @@ class Dataset:
 
     def scale(self, batch: Minibatch) -> float:
         """B of Eq. 6: episodes that a segment of the minibatch stands for."""
-        return len(self.episodes) / len(batch.start)
+        segments, length = batch.frames.shape[:2]
+        starts = self.episodes.horizon + 2 - length
+        return float(self._firsts(length).sum() / starts / segments)
+
+    def _firsts(self, length: int) -> NDArray[np.int64]:
+        """(N,) segments of ``length`` frames that each episode has."""
+        return np.asarray(np.maximum(self.episodes.lengths + 2 - length, 0))
 
     def posterior(self, model: LatentModel) -> Segments:
         """q(z | s) of every episode."""

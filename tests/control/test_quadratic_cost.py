@@ -22,7 +22,8 @@ def batch(cost, seed=0, episodes=N, horizon=T, size=m, noise=0.0) -> Trajectorie
     actions = rng.normal(size=(episodes, horizon, a))
     costs = np.stack([cost(z[:, t], t) for t in range(horizon)], axis=1)
     costs += ALPHA * np.square(actions).sum(axis=-1) + noise * rng.normal(size=costs.shape)
-    return Trajectories(*map(torch.as_tensor, (z, actions, actions, costs)))
+    live = np.ones(costs.shape, np.bool_)
+    return Trajectories(*map(torch.as_tensor, (z, actions, actions, costs, live)))
 
 
 def quadratic(z, t=0, C=C, c=c, b=b):
@@ -225,7 +226,9 @@ def test_a_good_representation_is_not_taken_for_a_dead_one(seed):
     costs = np.square(place - goal).sum(axis=-1)[:, :-1]
     actions = np.zeros((60, 50, 2))
     learned, judge = (
-        Trajectories(*(torch.as_tensor(part[rows]) for part in (z, actions, actions, costs)))
+        Trajectories(
+            *(torch.as_tensor(part[rows]) for part in (z, actions, actions, costs, costs > -1))
+        )
         for rows in (slice(51), slice(51, None))
     )
     assert explained(fit(learned, features=4, per_time="never").model, judge) > 0.8

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from solar_cli.envs.rasteriser import Box, Disc, draw_blobs, draw_figure, enlarge
+from solar_cli.envs.rasteriser import Box, Disc, draw_blobs, draw_figure, enlarge, shrink
 
 
 def drawn(centres, deviation=1.0, shape=(32, 32)):
@@ -171,3 +171,12 @@ def test_a_part_covers_those_before_it():
     )
     assert (one[0, 20, 20], other[0, 20, 20]) == (200, 100)
     assert one[0, 20, 16] == other[0, 20, 16] == 200
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(6, 4), (3, 2), (4, 3), (7, 9), (1, 1)])
+def test_a_shrunk_image_keeps_the_light_of_every_area(rows, columns):
+    """Enlarged by repetition to a common size, old and new pixels that cover it alike agree."""
+    image = np.random.default_rng(0).uniform(size=(2, 6, 4))
+    fine = image.repeat(rows, axis=1).repeat(columns, axis=2)
+    expected = fine.reshape(2, rows, 6, columns, 4).mean(axis=(2, 4))
+    np.testing.assert_allclose(shrink(image, rows, columns), expected, atol=1e-12)

@@ -54,7 +54,7 @@ def test_a_changed_head_is_undone_by_line_six_alone(tmp_path, linearise, preserv
         head.bias.copy_(mixing @ head.bias + 0.1)
     run.learner.representation.moved_in = 3
     assert change(run, episodes) > 0.3
-    states = run.learner.embedded(episodes)
+    states, _ = run.learner.embedded(episodes, [])
     run.learner.handed = run.learner.linearised(region, states).policy
     # The new latents are an affine map of the old ones, which a linear policy can undo.
     assert (change(run, episodes) < 0.01) == preserved
@@ -93,7 +93,7 @@ def test_a_frozen_encoder_leaves_the_policy_as_it_is(tmp_path):
     run, region, episodes = before_the_update(tmp_path, "true")
     run.learner.representation.update(Experience(run.environment))
     assert run.learner.representation.moved_in == 1
-    previous = run.learner.linearised(region, run.learner.embedded(episodes))
+    previous = run.learner.linearised(region, run.learner.embedded(episodes, [])[0])
     for left, right in zip(previous.policy, run.learner.gains, strict=True):
         assert torch.equal(left, right)
 

@@ -46,7 +46,7 @@ def test_an_update_that_promises_little_is_tried_before_it_is_handed_over(
         assert torch.equal(handed, part)
     run.environment.begin(3)
     run.learner.collect(Experience(run.environment))
-    z = run.learner.embedded(run.environment.collected(3))
+    z, _ = run.learner.embedded(run.environment.collected(3), [])
     means = torch.einsum("tij,ntj->nti", newest.K, z.z[:, :-1]) + newest.k
     torch.testing.assert_close(z.action_means, means)  # the newest is what is tried
 

@@ -60,6 +60,10 @@ class Stacking:
             self._world.advance(self._control.targets(action, self._world.joints()))
         return self._frame(), cost
 
+    def ended(self) -> bool:
+        """As `Simulation.ended`: never early."""
+        return False
+
     def measures(self) -> dict[str, float]:
         """``distance`` of the brick from its seat in cm, and whether it is ``stacked``: 1 or 0."""
         held, lower = self._world.held(), self._world.lower()
