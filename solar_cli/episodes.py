@@ -11,6 +11,7 @@ import hashlib
 import io
 import os
 import warnings
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,13 +26,22 @@ from solar_cli.settings import TaskSettings
 from solar_cli.streams import Streams
 
 Floats = NDArray[np.float64]
+HELD = 8
+"""batches of frames held in memory: more than a local method at its defaults asks for in a turn"""
+
+ARRAYS = ("frames", "actions", "action_means", "costs")
+"""what every file of episodes holds, by the names of `Episodes`"""
 
 
 class Policy(Protocol):
     """What acts. Noise is drawn when an episode starts, so that it may be smooth over time."""
 
     def start(self, episodes: int, stream: np.random.Generator | None) -> Any:
-        """The state that ``act`` carries; without a stream the policy is noise-free."""
+        """The state that ``act`` carries; without a stream the policy is noise-free.
+
+        Episodes may come in groups, each with a call of its own and all with one stream: what is
+        drawn is drawn episode by episode.
+        """
 
     def act(self, observations: NDArray[Any], t: int, state: Any) -> tuple[Floats, Floats, Any]:
         """Actions (N, a) for windows (N, W, *frame) at step ``t``, their means, the state."""
@@ -51,6 +61,12 @@ class Episodes:
     """(N, T) of the state and the executed action of each step"""
     window: int = 1
     """frames an observation holds"""
+    lengths: NDArray[np.int64] = None  # type: ignore[assignment]
+    """(N,) live steps of each episode; T, the default, where nothing ended early"""
+
+    def __post_init__(self) -> None:
+        if self.lengths is None:
+            object.__setattr__(self, "lengths", np.full(len(self.frames), self.horizon))
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -60,6 +76,16 @@ class Episodes:
         """T: actions an episode has."""
         return int(self.actions.shape[1])
 
+    @property
+    def live_steps(self) -> NDArray[np.bool_]:
+        """(N, T) whether an episode was still running: nothing may be learned from other steps."""
+        return np.asarray(np.arange(self.horizon) < self.lengths[:, None])
+
+    @property
+    def live_frames(self) -> NDArray[np.bool_]:
+        """(N, T+1) the frames that live steps start from and lead to."""
+        return np.asarray(np.arange(self.horizon + 1) <= self.lengths[:, None])
+
     def __getitem__(self, rows: Any) -> Episodes:
         return Episodes(
             self.frames[rows],
@@ -67,6 +93,7 @@ class Episodes:
             self.action_means[rows],
             self.costs[rows],
             self.window,
+            self.lengths[rows],
         )
 
     @staticmethod
@@ -78,6 +105,7 @@ class Episodes:
             np.concatenate([part.action_means for part in parts]),
             np.concatenate([part.costs for part in parts]),
             parts[0].window,
+            np.concatenate([part.lengths for part in parts]),
         )
 
 
@@ -91,6 +119,23 @@ class Evaluation:
     truth: Floats
     """(N, T+1, k) true positions, to diagnose latents with"""
     truth_names: tuple[str, ...] = ()
+
+    @staticmethod
+    def joined(parts: Sequence[Evaluation]) -> Evaluation:
+        """All episodes of several groups; ground truth that one of them lacks is missing in all."""
+        if len(parts) == 1:
+            return parts[0]
+        names = set.intersection(*(set(part.measures) for part in parts))
+        whole = all(part.truth_names for part in parts)
+        return Evaluation(
+            Episodes.joined([part.episodes for part in parts]),
+            {
+                name: np.concatenate([part.measures[name] for part in parts])
+                for name in sorted(names)
+            },
+            np.concatenate([part.truth if whole else part.truth[..., :0] for part in parts]),
+            parts[0].truth_names if whole else (),
+        )
 
     def summary(self) -> dict[str, Floats]:
         """One number an episode: return, and each measure's final and mean value."""
@@ -114,7 +159,23 @@ def roll_out(
     resets: Sequence[np.random.Generator],
     noise: np.random.Generator | None,
 ) -> Evaluation:
-    """Run one episode for each reset stream, all at once."""
+    """Run one episode for each reset stream, as many side by side as the task allows."""
+    size = task.at_once or len(resets)
+    groups = [resets[i : i + size] for i in range(0, len(resets), size)]
+    return Evaluation.joined([_run(task, settings, policy, group, noise) for group in groups])
+
+
+def _run(
+    task: Task,
+    settings: TaskSettings,
+    policy: Policy,
+    resets: Sequence[np.random.Generator],
+    noise: np.random.Generator | None,
+) -> Evaluation:
+    """Run one episode for each reset stream, all at once.
+
+    In the steps after an episode's end no action is executed; they cost what the task says.
+    """
     count, horizon, window = len(resets), settings.horizon, settings.observation.window
     index = window_indices(horizon, window)
     first = task.reset(resets)
@@ -123,27 +184,32 @@ def roll_out(
     actions = np.empty((count, horizon, settings.action.size))
     means = np.empty_like(actions)
     costs = np.empty((count, horizon))
+    lengths = np.full(count, horizon)
     measures, truths = [_ground_truth(task)[0]], [_ground_truth(task)[1]]
     state = policy.start(count, noise)
     for t in range(horizon):
         wanted, means[:, t], state = policy.act(frames[:, index[t]], t, state)
         actions[:, t] = np.clip(wanted, -settings.action.bound, settings.action.bound)
         frames[:, t + 1], costs[:, t] = task.step(actions[:, t])
+        actions[lengths <= t, t] = means[lengths <= t, t] = 0.0
+        lengths[task.ended() & (lengths > t)] = t + 1
         measured, truth = _ground_truth(task)
         measures.append(measured)
         truths.append(truth)
     names = set(measures[0]).intersection(*measures)
     return Evaluation(
-        Episodes(frames, actions, means, costs, window),
+        Episodes(frames, actions, means, costs, window, lengths),
         {name: np.stack([step[name] for step in measures], axis=1) for name in sorted(names)},
-        *_stacked(truths, task.truth_names),
+        *_stacked(truths, count, task.truth_names),
     )
 
 
-def _stacked(truths: list[Floats], names: tuple[str, ...]) -> tuple[Floats, tuple[str, ...]]:
+def _stacked(
+    truths: list[Floats], episodes: int, names: tuple[str, ...]
+) -> tuple[Floats, tuple[str, ...]]:
     """Positions of all steps, or none where one is missing."""
-    if any(truth.shape != (len(truths[-1]), len(names)) for truth in truths):
-        return np.empty((len(truths[-1]), len(truths), 0)), ()
+    if any(truth.shape != (episodes, len(names)) for truth in truths):
+        return np.empty((episodes, len(truths), 0)), ()
     return np.stack(truths, axis=1), names
 
 
@@ -179,7 +245,7 @@ class Environment:
         self._streams = streams
         self._folder = folder
         self._ledger: list[dict[str, Any]] = []
-        self._kept: dict[tuple[int, int], Episodes] = {}
+        self._held: OrderedDict[tuple[int, int], Episodes] = OrderedDict()  # last asked for last
         self._call = 0
 
     @property
@@ -190,7 +256,7 @@ class Environment:
     @property
     def steps(self) -> int:
         """Actions executed so far."""
-        return self.episodes * self.settings.horizon
+        return sum(int(entry["steps"]) for entry in self._ledger)
 
     def begin(self, iteration: int) -> None:
         """Start, or start again, an iteration."""
@@ -213,14 +279,16 @@ class Environment:
                 streams.generator("noise") if noisy else None,
             )
             found = collected.episodes
-            stored = self._store(key, noisy, collected)
-            if entry is None:
-                self._ledger.append(stored)
-            elif stored["sha256"] != entry["sha256"]:
+            data = _packed(found)
+            made = self._described(key, noisy, collected, data)
+            # Compared as files: one that another zlib has compressed counts as another, too.
+            if entry is not None and made["sha256"] != entry["sha256"]:
                 # The policy is not the one that collected them: a training has gone on since.
                 raise self._lost(entry)
-        self._kept[key] = found
-        return found
+            self._store(made["file"], data)
+            if entry is None:
+                self._ledger.append(made)
+        return self._hold(key, found)
 
     def collected(self, iteration: int) -> Episodes:
         """All episodes of one iteration."""
@@ -248,17 +316,26 @@ class Environment:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Take up a ledger; the episodes are read when they are asked for."""
-        self._ledger = [dict(entry) for entry in state["ledger"]]
-        self._kept.clear()
+        self._ledger = [
+            {"steps": entry["episodes"] * self.settings.horizon, **entry}  # older ones lack it
+            for entry in state["ledger"]
+        ]
+        self._held.clear()
 
     def _get(self, entry: Mapping[str, Any]) -> Episodes:
         key = (int(entry["iteration"]), int(entry["call"]))
-        if key not in self._kept:
-            found = self._load(entry)
-            if found is None:
-                raise self._lost(entry)
-            self._kept[key] = found
-        return self._kept[key]
+        found = self._held[key] if key in self._held else self._load(entry)
+        if found is None:
+            raise self._lost(entry)
+        return self._hold(key, found)
+
+    def _hold(self, key: tuple[int, int], episodes: Episodes) -> Episodes:
+        """Keep episodes in memory until others have been asked for since."""
+        self._held[key] = episodes
+        self._held.move_to_end(key)
+        if len(self._held) > HELD:
+            self._held.popitem(last=False)
+        return episodes
 
     def _lost(self, entry: Mapping[str, Any]) -> LostFiles:
         return LostFiles(
@@ -276,19 +353,28 @@ class Environment:
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             return Episodes(**dict(arrays), window=self.settings.observation.window)
 
-    def _store(self, key: tuple[int, int], noisy: bool, collected: Evaluation) -> dict[str, Any]:
-        """Write the file whole or not at all, and describe it."""
+    def _described(
+        self, key: tuple[int, int], noisy: bool, collected: Evaluation, data: bytes
+    ) -> dict[str, Any]:
+        """The ledger's entry of episodes whose file holds ``data``."""
         episodes = collected.episodes
-        buffer = io.BytesIO()
-        np.savez_compressed(
-            buffer,
-            frames=episodes.frames,
-            actions=episodes.actions,
-            action_means=episodes.action_means,
-            costs=episodes.costs,
-        )
-        data = buffer.getvalue()
-        name = f"{key[0]:04d}-{key[1]}.npz"
+        clipped = np.abs(episodes.actions[episodes.live_steps]) >= self.settings.action.bound
+        return {
+            "iteration": key[0],
+            "call": key[1],
+            "noisy": noisy,
+            "episodes": len(episodes),
+            "steps": int(episodes.lengths.sum()),
+            "file": f"{key[0]:04d}-{key[1]}.npz",
+            "sha256": hashlib.sha256(data).hexdigest(),
+            "summary": {
+                **{name: float(values.mean()) for name, values in collected.summary().items()},
+                "clipped": float(clipped.mean()),
+            },
+        }
+
+    def _store(self, name: str, data: bytes) -> None:
+        """Write the file whole or not at all."""
         self._folder.mkdir(parents=True, exist_ok=True)
         beside = self._folder / f".{name}.{os.getpid()}"
         with beside.open("wb") as file:
@@ -296,19 +382,16 @@ class Environment:
             file.flush()
             os.fsync(file.fileno())
         beside.replace(self._folder / name)
-        clipped = np.abs(episodes.actions) >= self.settings.action.bound
-        return {
-            "iteration": key[0],
-            "call": key[1],
-            "noisy": noisy,
-            "episodes": len(episodes),
-            "file": name,
-            "sha256": hashlib.sha256(data).hexdigest(),
-            "summary": {
-                **{name: float(values.mean()) for name, values in collected.summary().items()},
-                "clipped": float(clipped.mean()),
-            },
-        }
+
+
+def _packed(episodes: Episodes) -> bytes:
+    """What the file of these episodes holds; equal episodes give equal bytes."""
+    arrays = {name: getattr(episodes, name) for name in ARRAYS}
+    if not episodes.live_steps.all():  # a file of whole episodes keeps the bits that it always had
+        arrays["lengths"] = episodes.lengths
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, allow_pickle=False, **arrays)
+    return buffer.getvalue()
 
 
 class Experience:

@@ -2,6 +2,7 @@
 
 import copy
 import warnings
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import pytest
 
 from solar_cli.envs import build_task
 from solar_cli.episodes import (
+    HELD,
     Environment,
     Episodes,
     Evaluation,
@@ -30,6 +32,7 @@ class Sums:
     """The state is the sum of the actions so far; a frame is the state, and which step it is."""
 
     horizon, action_size, action_bound, truth_names = T, 1, BOUND, ("x",)
+    at_once: int | None = None
 
     def reset(self, streams):
         self.x = np.array([stream.uniform() for stream in streams])
@@ -46,11 +49,34 @@ class Sums:
         self.step_number += 1
         return self.frames(), costs
 
+    def ended(self):
+        return np.zeros(len(self.x), np.bool_)
+
     def measures(self):
         return {"place": self.x.copy(), "square": self.x**2}
 
     def truth(self):
         return self.x[:, None].copy()
+
+
+class Ending(Sums):
+    """Episodes end where the sum leaves [0, 1]; it stays there, and a step then costs 7."""
+
+    def reset(self, streams):
+        frames = super().reset(streams)
+        self.over = np.zeros(len(self.x), np.bool_)
+        self.last = frames
+        return frames
+
+    def step(self, actions):
+        over = self.over.copy()
+        frames, costs = super().step(np.where(over[:, None], 0.0, actions))
+        self.over |= (self.x < 0.0) | (self.x > 1.0)
+        self.last = np.where(over[:, None], self.last, frames)
+        return self.last.copy(), np.where(over, 7.0, costs)
+
+    def ended(self):
+        return self.over.copy()
 
 
 class Failing(Sums):
@@ -118,7 +144,7 @@ def files(environment: Environment) -> list[Path]:
 
 
 def assert_equal_bits(a: Episodes, b: Episodes) -> None:
-    for name in ("frames", "actions", "action_means", "costs"):
+    for name in ("frames", "actions", "action_means", "costs", "lengths"):
         left, right = getattr(a, name), getattr(b, name)
         assert left.dtype == right.dtype, name
         assert left.shape == right.shape, name
@@ -140,6 +166,37 @@ def test_a_policy_sees_windows_that_end_at_the_present_frame(settings: TaskSetti
     roll_out(Sums(), settings, policy, [np.random.default_rng(0)], None)
     numbers = [shown[0, :, 1].tolist() for shown in policy.shown]
     assert numbers == [[0, 0, 0], [0, 0, 1], [0, 1, 2], [1, 2, 3], [2, 3, 4]]
+
+
+@pytest.mark.parametrize("at_once", [1, 3, 7, 20])
+def test_episodes_do_not_depend_on_how_many_run_side_by_side(settings: TaskSettings, at_once):
+    def run(task):
+        resets = [Streams(2).generator("reset", i) for i in range(7)]
+        return roll_out(task, settings, Pull(), resets, Streams(2).generator("noise"))
+
+    grouped = Sums()
+    grouped.at_once = at_once
+    found, whole = run(grouped), run(Sums())
+    for name in ("frames", "actions", "action_means", "costs"):
+        left, right = getattr(found.episodes, name), getattr(whole.episodes, name)
+        np.testing.assert_array_equal(left, right)
+    np.testing.assert_array_equal(found.truth, whole.truth)
+    assert found.summary().keys() == whole.summary().keys()
+    np.testing.assert_array_equal(found.measures["place"], whole.measures["place"])
+
+
+def test_ground_truth_that_a_group_lacks_is_missing_in_all(settings: TaskSettings):
+    task = Failing("truth", T)
+    task.at_once, starts = 2, iter([99, 1])
+    reset = task.reset
+    task.reset = lambda streams: (setattr(task, "first", next(starts)), reset(streams))[1]
+    resets = [Streams(2).generator("reset", i) for i in range(4)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = roll_out(task, settings, Pull(), resets, None)
+    assert found.truth.shape == (4, T + 1, 0)
+    assert found.truth_names == ()
+    assert found.measures == {}  # both come from one look
 
 
 def test_executed_actions_are_clipped_and_costs_are_theirs(settings: TaskSettings):
@@ -180,6 +237,82 @@ def test_joined_batches_keep_the_order_of_their_episodes(environment: Environmen
     assert joined.horizon == T
     assert_equal_bits(joined[:2], parts[0])
     assert_equal_bits(joined[2:], parts[1])
+
+
+# What ends early
+
+
+@pytest.fixture
+def ending(settings: TaskSettings, tmp_path: Path) -> Environment:
+    return Environment(Ending(), settings, Streams(1), tmp_path / "ending")
+
+
+def test_an_episode_is_as_long_as_its_task_says(ending: Environment):
+    ending.begin(1)
+    found = ending.collect(Pull(gain=0.0, std=0.4), 40)
+    x = found.frames[..., 0]
+    outside = (x < 0.0) | (x > 1.0)
+    expected = np.where(outside.any(axis=1), outside.argmax(axis=1), T)
+    np.testing.assert_array_equal(found.lengths, expected)
+    assert {1, T} < set(expected.tolist())
+    for episode, length in enumerate(found.lengths.tolist()):
+        assert found.live_steps[episode].tolist() == [t < length for t in range(T)]
+        assert found.live_frames[episode].tolist() == [t <= length for t in range(T + 1)]
+        np.testing.assert_array_equal(
+            found.frames[episode, length:],
+            np.broadcast_to(found.frames[episode, length], (T + 1 - length, 2)),
+        )
+    assert (found.costs[~found.live_steps] == 7.0).all()
+    assert not found.actions[~found.live_steps].any()
+    assert not found.action_means[~found.live_steps].any()
+    assert found.actions[found.live_steps].all()
+
+
+def test_live_steps_are_those_of_a_task_that_goes_on(ending: Environment, environment: Environment):
+    batches = []
+    for one in (ending, environment):
+        one.begin(1)
+        batches.append(one.collect(Pull(gain=0.0, std=0.4), 40))
+    for name in ("actions", "action_means", "costs"):
+        left, right = (getattr(batch, name)[batches[0].live_steps] for batch in batches)
+        np.testing.assert_array_equal(left, right)
+
+
+def test_lengths_survive_their_file_and_go_where_episodes_go(ending: Environment):
+    ending.begin(1)
+    parts = [ending.collect(Pull(gain=0.0, std=0.4), count) for count in (20, 10)]
+    fresh = again(ending, 1)
+    fresh._task = Ending()
+    assert_equal_bits(fresh.collected(1), Episodes.joined(parts))
+    rows = np.array([25, 3])
+    joined = Episodes.joined(parts)
+    np.testing.assert_array_equal(joined[rows].lengths, [parts[1].lengths[5], parts[0].lengths[3]])
+
+
+def test_only_executed_actions_are_counted(ending: Environment):
+    ending.begin(1)
+    found = ending.collect(Pull(gain=0.0, std=0.4), 40)
+    assert ending.steps == found.lengths.sum() < 40 * T
+    clipped = np.abs(found.actions[found.live_steps]) == BOUND
+    assert ending.summary(1)["clipped"] == pytest.approx(clipped.mean(), rel=1e-12)
+    assert ending.summary(1)["return"] == pytest.approx(-found.costs.sum(axis=1).mean(), rel=1e-12)
+
+
+def test_a_file_of_whole_episodes_holds_what_it_always_held(environment: Environment):
+    environment.begin(1)
+    environment.collect(Pull(), 2)
+    with np.load(files(environment)[0]) as arrays:
+        assert set(arrays) == {"frames", "actions", "action_means", "costs"}
+
+
+def test_a_ledger_without_steps_is_of_whole_episodes(environment: Environment):
+    environment.begin(1)
+    environment.collect(Pull(), 3)
+    state = environment.state_dict()
+    for entry in state["ledger"]:
+        del entry["steps"]
+    environment.load_state_dict(state)
+    assert environment.steps == 3 * T
 
 
 # What counts
@@ -330,12 +463,19 @@ def test_what_was_collected_again_is_there_for_later_processes(environment: Envi
     assert_equal_bits(again(fresh, 2).recent(2)[0], collected)
 
 
-def test_collecting_again_with_another_policy_is_refused(environment: Environment):
+@damaged
+def test_collecting_again_with_another_policy_is_refused_and_changes_no_file(
+    environment: Environment, damage
+):
     environment.begin(1)
     environment.collect(Pull(), 4)
-    files(environment)[0].unlink()
-    with pytest.raises((SolarError, OSError), match=r"0001-0\.npz"):
-        again(environment, 1).collect(Pull(gain=0.9), 4)
+    damage(files(environment)[0])
+    before = {file.name: file.read_bytes() for file in files(environment)}
+    fresh = again(environment, 1)
+    with pytest.raises(SolarError, match=r"0001-0\.npz.*restore the file"):
+        fresh.collect(Pull(gain=0.9), 4)
+    assert {file.name: file.read_bytes() for file in files(environment)} == before
+    assert fresh.state_dict() == environment.state_dict()
 
 
 @damaged
@@ -351,6 +491,22 @@ def test_a_damaged_file_of_an_older_iteration_is_refused(environment: Environmen
     for ask in (lambda: fresh.recent(2), lambda: fresh.collected(1)):
         with pytest.raises((SolarError, OSError), match=r"0001-0\.npz.*damaged.*--redo"):
             ask()
+
+
+def test_frames_of_long_ago_leave_memory_and_are_read_again(environment: Environment):
+    held: list[weakref.ref[Episodes]] = []
+    starts = []
+    for iteration in range(1, HELD + 6):
+        environment.begin(iteration)
+        collected = environment.collect(Pull(), 2)
+        environment.collected(1)  # asked for every time
+        held.append(weakref.ref(collected))
+        starts.append(collected.frames[:, 0].copy())
+    del collected
+    alive = [iteration for iteration, batch in enumerate(held, 1) if batch() is not None]
+    assert alive == [1, *range(len(held) - HELD + 2, len(held) + 1)]
+    for found, start in zip(environment.recent(len(held)), starts, strict=True):
+        np.testing.assert_array_equal(found.frames[:, 0], start)
 
 
 def test_no_half_written_file_is_left(environment: Environment):

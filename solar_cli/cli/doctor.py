@@ -17,7 +17,7 @@ def command(json: AsJson = False, db: Database = None) -> None:
     Example:
       solar doctor
     """
-    from solar_cli.cli.health import Verdict, checks
+    from solar_cli.experiment.machine import Verdict, checks
 
     found = list(checks(db))
     if json:

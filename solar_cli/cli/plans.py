@@ -11,6 +11,7 @@ from solar_cli.experiment.estimates import Estimate
 from solar_cli.experiment.matrix import Action, Plan
 from solar_cli.experiment.scheduler import Result, default_workers
 from solar_cli.store.records import Outcome
+from solar_cli.wording import counted
 
 
 def planned(plan: Plan) -> dict[str, Any]:
@@ -79,16 +80,11 @@ def print_estimates(
         else "a time that is unknown until one such cell has finished"
     )
     say(
-        f"{len(work)} of {counted(len(plans))} to compute, {at_once} at a time: {time}; "
+        f"{len(work)} of {counted(len(plans), 'cell')} to compute, {at_once} at a time: {time}; "
         "nothing was started"
         if work
-        else f"{counted(len(plans))} and nothing to compute; nothing was started"
+        else f"{counted(len(plans), 'cell')} and nothing to compute; nothing was started"
     )
-
-
-def counted(cells: int) -> str:
-    """``1 cell`` or ``2 cells``."""
-    return f"{cells} cell{'s' * (cells != 1)}"
 
 
 def mebibytes(size: int | None) -> str:

@@ -43,6 +43,24 @@ def require_free_label(store: Store, cells: Sequence[Cell], label: str | None) -
             )
 
 
+def require_memory(cells: Sequence[Cell]) -> None:
+    """Raise `UsageError` where a cell cannot fit into this machine, whatever runs beside it."""
+    from solar_cli.experiment.estimates import memory_needs
+    from solar_cli.experiment.provenance import memory_bytes
+
+    installed = memory_bytes("MemTotal")
+    for cell in _distinct(cells):
+        needs = memory_needs(cell)
+        needed = sum(need.bytes for need in needs)
+        if installed is not None and needed > installed:
+            largest = max(needs, key=lambda need: need.bytes)
+            raise UsageError(
+                f"{cell.task}/{cell.method}: takes at least {_gibibytes(needed)} of memory "
+                f"({largest.what}: {_gibibytes(largest.bytes)}), this machine has "
+                f"{_gibibytes(installed)}: lower {' or '.join(largest.settings)}"
+            )
+
+
 def require_tasks(cells: Sequence[Cell]) -> None:
     """Raise `UsageError` where a task cannot be built, or has not the measure that judges it."""
     from solar_cli.envs import build_task
@@ -88,6 +106,10 @@ def require_learners(cells: Sequence[Cell]) -> None:
                 f"{cell.task}/{cell.method}: its learner cannot be made "
                 f"({type(error).__name__}: {error}); correct the method's settings"
             ) from error
+
+
+def _gibibytes(size: int) -> str:
+    return f"{size / 2**30:.1f} GiB"
 
 
 def _distinct(cells: Sequence[Cell]) -> list[Cell]:

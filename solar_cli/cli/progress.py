@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from solar_cli.cli.printing import console, duration, number, print_json, say, table
+from solar_cli.wording import counted
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -22,7 +23,7 @@ def watching(json: bool, cells: int) -> Iterator[Report]:
     """What the scheduler reports its events to, as long as it computes that many cells."""
     if json:
         yield Lines(json_line)
-    elif console().is_terminal:
+    elif cells and console().is_terminal:
         from rich.live import Live
 
         board = Board(cells)
@@ -121,9 +122,8 @@ def plain_line(event: Event) -> str:
     if event.kind == "started":
         return f"{title}: started"
     iteration, episodes = standing(event)
-    where = (
-        "" if message is None else f"iteration {iteration}, {episodes}/{event.plan.target} episodes"
-    )
+    reached = f"{episodes}/{counted(event.plan.target, 'episode')}"
+    where = "" if message is None else f"iteration {iteration}, {reached}"
     if event.kind == "ended" and result is not None:
         outcome = "not started" if result.outcome is None else result.outcome.value
         parts = [f"{title}: {outcome}", where, headline(event), result.cause]

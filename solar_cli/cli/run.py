@@ -90,6 +90,7 @@ def command(
         require_device,
         require_free_label,
         require_learners,
+        require_memory,
         require_tasks,
     )
     from solar_cli.cli.shadowing import tell_shadowed
@@ -103,7 +104,9 @@ def command(
         plans = plan(store, matrix, wanted, redo=redo, retry=retry)
         work = [planned.cell for planned in plans if planned.is_work]
         require_free_label(store, work, label)
-        require_tasks(work)
+        if work:
+            require_memory(work)
+            require_tasks(work)
         if dry_run:
             from solar_cli.experiment.estimates import estimate
 

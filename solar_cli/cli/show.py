@@ -10,9 +10,11 @@ import typer
 
 from solar_cli.cli.options import AsJson, Database
 from solar_cli.cli.printing import complain, duration, print_json, print_table, say
+from solar_cli.wording import counted
 
 if TYPE_CHECKING:
     from solar_cli.cli.configuration import Line
+    from solar_cli.reporting.timing import Share
     from solar_cli.store.records import AttemptRecord, CellRecord
 
 LOG_LINES = 15
@@ -29,6 +31,7 @@ def command(
     Example:
       solar show 3f2a
     """
+    from solar_cli.reporting.timing import shares
     from solar_cli.store.store import Store
 
     with Store.open(db, read_only=True) as store:
@@ -36,6 +39,7 @@ def command(
         headline = record.cell.configuration.evaluation.headline
         curve = store.metrics(hashes=[record.hash], names=[headline], splits=["noise_free"])
         attempts = store.attempts(record.hash)
+        times = shares(store, [record])
         folder = store.folder(record.hash)
     changed = _changed(record)
     log = _end_of(folder / "log.txt")
@@ -52,6 +56,7 @@ def command(
                 "headline": headline,
                 "curve": [[row["episodes"], row["value"]] for row in curve],
                 "configuration": record.cell.config(),
+                "time": [asdict(share) for share in times],
                 "changed": [asdict(line) for line in changed],
                 "attempts": [_plain(attempt) for attempt in attempts],
                 "log": log,
@@ -59,6 +64,7 @@ def command(
         )
         return
     _print(record, folder, headline, curve)
+    _print_times(times)
     _print_changed(changed)
     _print_attempts(attempts)
     say(f"End of {folder / 'log.txt'}:" if log else "No log yet.")
@@ -92,7 +98,7 @@ def _print(record: CellRecord, folder: Path, headline: str, curve: list[dict[str
     code = f"{record.commit[:7]}{' with changes' if record.dirty else ''}" if record.commit else "?"
     say(f"{record.cell.title}  ({record.hash})")
     say(
-        f"{record.state.value}: iteration {record.iteration}, {record.episodes} episodes"
+        f"{record.state.value}: iteration {record.iteration}, {counted(record.episodes, 'episode')}"
         + ("" if record.target is None else f" of {record.target}")
         + f", {duration(record.seconds)} of computing, commit {code}"
     )
@@ -104,10 +110,16 @@ def _print(record: CellRecord, folder: Path, headline: str, curve: list[dict[str
     evaluation = record.cell.configuration.evaluation
     unit = f" in {evaluation.unit}" if evaluation.unit else ""
     good = f"{evaluation.better} is better"
-    say(f"{headline}{unit}, {evaluation.episodes} noise-free episodes ({good})")
+    say(f"{headline}{unit}, {counted(evaluation.episodes, 'noise-free episode')} ({good})")
     for line in plot([row["episodes"] for row in curve], [row["value"] for row in curve]):
         say(line)
     say()
+
+
+def _print_times(times: list[Share]) -> None:
+    rows = [(time.activity, duration(time.seconds), f"{time.share:.1%}") for time in times]
+    if rows:
+        print_table(("activity", "time>", "share>"), rows, "Where the time went")
 
 
 def _print_changed(changed: list[Line]) -> None:

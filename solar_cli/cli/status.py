@@ -11,6 +11,7 @@ import typer
 
 from solar_cli.cli.options import AsJson, Database, Methods, Tasks, Variants
 from solar_cli.cli.printing import console, print_json, say
+from solar_cli.wording import counted
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -75,7 +76,7 @@ def counts(lines: Sequence[Line]) -> str:
     """How many cells are in which state: ``3 cells: 2 finished, 1 running``."""
     states = Counter("stale" if line.stale else line.record.state.value for line in lines)
     inside = ", ".join(f"{count} {state}" for state, count in sorted(states.items()))
-    return f"{len(lines)} cell{'s' * (len(lines) != 1)}: {inside}"
+    return f"{counted(len(lines), 'cell')}: {inside}"
 
 
 def summary(lines: Sequence[Line]) -> RenderableType:

@@ -27,6 +27,15 @@ class LinearGaussianPolicy(NamedTuple):
     k: Float[Tensor, "*batch T a"]
     S: Float[Tensor, "*batch T a a"]
 
+    def until(self, steps: int) -> LinearGaussianPolicy:
+        """Of the first time steps; without batch axes."""
+        return LinearGaussianPolicy(*(part[:steps] for part in self))
+
+    def held(self, steps: int, horizon: int) -> LinearGaussianPolicy:
+        """Of the first time steps, the last of which goes on until T = ``horizon``; no batch."""
+        times = torch.arange(horizon).clamp(max=steps - 1)
+        return LinearGaussianPolicy(*(part[times] for part in self))
+
 
 class LinearDynamics(NamedTuple):
     """z_{t+1} ~ N(F_t x_t + f_t, Sigma_t) from z_0 ~ N(mu0, Sigma0)."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from solar_cli.control.linear_gaussian import LinearGaussianPolicy
@@ -43,6 +43,7 @@ class _RidgeFit(NamedTuple):
 def linearise_policy(
     latents: Float[Tensor, "N T d"],
     action_means: Float[Tensor, "N T a"],
+    live: Bool[Tensor, "N T"],
     previous: LinearGaussianPolicy,
 ) -> Linearisation:
     """The linear-Gaussian policy that acts on the new ``latents`` as the previous did on the old.
@@ -52,43 +53,48 @@ def linearise_policy(
     slopes come from data centred there and offsets from the exact means. One ridge, chosen by the
     leave-one-out error of all time steps, bears the directions that N episodes do not show.
     The covariance is the previous one plus that of the leave-one-out errors. An affine change of
-    the latents is recovered exactly when N > d + 1. At least two episodes are needed.
+    the latents is recovered exactly when N > d + 1. At every time step at least two episodes must
+    be ``live``; others do not count.
     """
-    episodes = latents.shape[0]
-    if episodes < 2:
+    if (episodes := int(live.sum(dim=0).min())) < 2:
         raise ValueError(f"linearise_policy needs at least 2 episodes, got {episodes}")
     z, actions = latents.double().transpose(0, 1), action_means.double().transpose(0, 1)
-    z_mean, a_mean = z.mean(1, keepdim=True), actions.mean(1, keepdim=True)
-    z_centred, a_centred = z - z_mean, actions - a_mean
-    fits = _ridge_fits(z_centred, a_centred)
+    weight = live[..., None].to(z).transpose(0, 1)
+    count = weight.sum(1, keepdim=True)
+    z_mean, a_mean = ((part * weight).sum(1, keepdim=True) / count for part in (z, actions))
+    z_centred, a_centred = (z - z_mean) * weight, (actions - a_mean) * weight
+    fits = _ridge_fits(z_centred, a_centred, weight)
     errors = [float(fit.left_out.square().sum()) for fit in fits]
     chosen = min(range(len(fits)), key=errors.__getitem__)
     fit = fits[chosen]
     k = a_mean[:, 0] - (fit.K @ z_mean.mT)[..., 0]
-    S = previous.S + fit.left_out.mT @ fit.left_out / episodes
+    S = previous.S + fit.left_out.mT @ fit.left_out / count
     total = float(a_centred.square().sum())
     residual = (errors[chosen] / total) ** 0.5 if total > 0 else 0.0
     return Linearisation(LinearGaussianPolicy(fit.K, k, S), residual, RIDGES[chosen])
 
 
-def _ridge_fits(z: Float[Tensor, "T N d"], actions: Float[Tensor, "T N a"]) -> list[_RidgeFit]:
+def _ridge_fits(
+    z: Float[Tensor, "T N d"], actions: Float[Tensor, "T N a"], weight: Float[Tensor, "T N 1"]
+) -> list[_RidgeFit]:
     """Ridge regressions of centred actions on centred latents, one for each of ``RIDGES``.
 
-    One singular value decomposition serves them all. The error on an episode left out of the fit
-    is its residual over 1 - h, h being its leverage, 1/N of which belongs to the mean.
+    Where ``weight`` is 0 and not 1 an episode does not count; its z and actions are zero there. One
+    singular value decomposition serves them all. The error on an episode left out of the fit is its
+    residual over 1 - h, h being its leverage, 1/N of which belongs to the mean.
     """
-    episodes = z.shape[1]
-    std = z.square().mean(1, keepdim=True).sqrt()
-    least = LEAST_STD * z.square().mean((0, 1)).sqrt()
+    count = weight.sum(1, keepdim=True)
+    std = (z.square().sum(1, keepdim=True) / count).sqrt()
+    least = LEAST_STD * (z.square().sum((0, 1)) / weight.sum()).sqrt()
     scale = torch.maximum(std, torch.where(least > 0, least, 1.0))
     U, s, Vh = torch.linalg.svd(z / scale, full_matrices=False)
     projected = U.mT @ actions
     fits = []
     for ridge in RIDGES:
-        denominator = s.square() + episodes * ridge
+        denominator = s.square() + count[..., 0] * ridge
         shrinkage = (s.square() / denominator)[..., None]
         coefficients = Vh.mT @ ((s / denominator)[..., None] * projected)
-        leverage = (U.square() @ shrinkage) + 1 / episodes
-        residual = actions - U @ (shrinkage * projected)
+        leverage = (U.square() @ shrinkage) + weight / count
+        residual = (actions - U @ (shrinkage * projected)) * weight
         fits.append(_RidgeFit((coefficients / scale.mT).mT, residual / (1 - leverage)))
     return fits

@@ -2,7 +2,8 @@
 
 Section 4.1 and appendix B: an MNIW prior per time step, conditioned on the episodes. Only the
 increment of the newest latent block is inferred; the other rows of F are what shifting does. Slopes
-are pooled from data that is centred per time step; offsets come from each step's exact means.
+are pooled from data that is centred per time step; offsets come from each step's exact means. Where
+all episodes have ended, the dynamics of the last step that one lived in go on.
 
 Axes: N episodes, T horizon, d latents of a block, z = W d entries, x = [z; a] with p entries.
 """
@@ -20,8 +21,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from solar_cli.control.linear_gaussian import LinearDynamics
-from solar_cli.control.trajectories import Trajectories
-from solar_cli.inference import gmm, mniw
+from solar_cli.control.trajectories import Trajectories, Transitions
+from solar_cli.inference import cholesky, gmm, mniw
 from solar_cli.models.priors import LatentPrior
 from solar_cli.settings.local import LocalFit
 from solar_cli.streams import Streams
@@ -51,11 +52,8 @@ class Increments(NamedTuple):
     Sigma: Float[Tensor, "T d d"]
 
 
-Pairs = tuple[Tensor, Tensor]
-"""x (T, N, p) and y (T, N, d) of one batch"""
-
-Fit = Callable[[Tensor, Tensor], Increments]
-"""from x (T, N, p) and y (T, N, d) to the dynamics of every time step"""
+Fit = Callable[[Transitions], Increments]
+"""from samples to the dynamics of every time step"""
 
 
 class LocalDynamics(NamedTuple):
@@ -73,13 +71,13 @@ def infer_dynamics(
     streams: Streams,
 ) -> LocalDynamics:
     """Local dynamics around the newest batch, given older ones and the representation's factor."""
-    x, y = newest.increments(prior.latent)
-    past = [batch.increments(prior.latent) for batch in older]
+    samples = newest.transitions(prior.latent)
+    past = [batch.transitions(prior.latent) for batch in older]
     metrics: dict[str, float] = {}
     if settings.method == "posterior":
-        sources = _sources(newest, past, prior, settings)
+        sources = _sources(samples, past, prior, settings)
         grid = _grid(sources, settings)
-        scores = [_held_out(partial(_posterior, sources, s), x, y, settings.folds) for s in grid]
+        scores = [_held_out(partial(_posterior, sources, s), samples, settings.folds) for s in grid]
         best = max(range(len(grid)), key=lambda i: scores[i].log_likelihood)
         fit: Fit = partial(_posterior, sources, grid[best])
         score = scores[best]
@@ -87,9 +85,9 @@ def infer_dynamics(
     else:
         mixture = partial(_mixture_prior, past, streams)
         fit = _regression if settings.method == "regression" else mixture
-        score = _held_out(fit, x, y, settings.folds)
+        score = _held_out(fit, samples, settings.folds)
     metrics |= {"one_step_log_likelihood": score.log_likelihood, "one_step_r2": score.r2}
-    return LocalDynamics(_whole(fit(x, y), newest, prior), metrics)
+    return LocalDynamics(_whole(fit(samples), newest, prior), metrics)
 
 
 class _Score(NamedTuple):
@@ -101,19 +99,21 @@ class _Score(NamedTuple):
     """share of the increments' variance that is predicted"""
 
 
-def _held_out(fit: Fit, x: Float[Tensor, "T N p"], y: Float[Tensor, "T N d"], folds: int) -> _Score:
-    count = x.shape[1]
+def _held_out(fit: Fit, samples: Transitions, folds: int) -> _Score:
+    count = samples.live.shape[1]
     fold = torch.arange(count) % min(folds, count)
     likelihood = squared = 0.0
     for k in range(int(fold.max()) + 1):
-        judge = fold == k
-        fitted = fit(x[:, ~judge], y[:, ~judge])
-        residual = y[:, judge] - x[:, judge] @ fitted.F.mT - fitted.f.unsqueeze(1)
-        spread = fitted.Sigma * (1 + 1 / float((~judge).sum()))
-        likelihood += float(_log_density(residual, spread).sum())
-        squared += float(residual.square().sum())
-    total = float((y - y.mean(dim=(0, 1))).square().sum())
-    return _Score(likelihood / (count * len(x)), 1 - squared / max(total, 1e-12))
+        learned, judge = samples.of(fold != k), samples.of(fold == k)
+        fitted = fit(learned)
+        residual = judge.y - judge.x @ fitted.F.mT - fitted.f.unsqueeze(1)
+        spread = fitted.Sigma * (1 + 1 / learned.counts[:, None, None])
+        likelihood += float((_log_density(residual, spread) * judge.live).sum())
+        squared += float((residual.square() * judge.live.unsqueeze(-1)).sum())
+    total = float(samples.live.sum())
+    deviation = samples.y - samples.y.sum(dim=(0, 1)) / total
+    spread_of_y = float((deviation.square() * samples.live.unsqueeze(-1)).sum())
+    return _Score(likelihood / total, 1 - squared / max(spread_of_y, 1e-12))
 
 
 class _Sources(NamedTuple):
@@ -125,24 +125,27 @@ class _Sources(NamedTuple):
 
 
 def _sources(
-    newest: Trajectories, past: Sequence[Pairs], prior: LatentPrior, settings: LocalFit
+    samples: Transitions, past: Sequence[Transitions], prior: LatentPrior, settings: LocalFit
 ) -> _Sources:
-    d, actions = prior.latent, newest.actions.shape[-1]
-    x, y = newest.increments(d)
-    spread = (x - x.mean(dim=1, keepdim=True)).square().mean(dim=(0, 1)).sqrt()
+    d, (x, y, live) = prior.latent, samples
+    actions = x.shape[-1] - len(prior.basis.b)
+    squares = (x - samples.means()[0]).square() * live.unsqueeze(-1)
+    spread = (squares.sum(dim=(0, 1)) / live.sum()).sqrt()
     ridge = torch.full_like(spread, settings.ridge)  # whitened latents have unit scale
     ridge[-actions:] = ACTION_RIDGE * spread[-actions:].clamp_min(1e-6)
     degrees = y.new_tensor(d + 2.0)
     weak = mniw.RegressionStatistics(
         degrees * settings.ridge**2 * torch.eye(d).to(y),
         y.new_zeros(d, len(spread)),
-        torch.diag(x.shape[1] * ridge.square()),
+        samples.counts[:, None, None] * torch.diag(ridge.square()),
         degrees,
     )
     model = None if prior.factor is None else _in_basis(prior, actions)
+    if model is not None and model.n.ndim:  # one factor a time step
+        model = mniw.RegressionStatistics(*(part[: len(x)] for part in model))
     if model is not None and settings.prior_counts != "own":
         model = _per_count(model)
-    statistics = [_centred_statistics(*pairs) for pairs in past]
+    statistics = [_centred_statistics(batch) for batch in past]
     joined = reduce(mniw.RegressionStatistics.plus, statistics) if statistics else None
     return _Sources(weak, model, None if joined is None else _per_count(joined))
 
@@ -166,12 +169,9 @@ def _per_count(statistics: mniw.RegressionStatistics) -> mniw.RegressionStatisti
     return statistics.scaled(1 / statistics.n.clamp_min(1.0))
 
 
-def _centred_statistics(
-    x: Float[Tensor, "T N p"], y: Float[Tensor, "T N d"]
-) -> mniw.RegressionStatistics:
-    return mniw.regression_statistics(
-        x - x.mean(dim=-2, keepdim=True), y - y.mean(dim=-2, keepdim=True)
-    )
+def _centred_statistics(samples: Transitions) -> mniw.RegressionStatistics:
+    x_mean, y_mean = samples.means()
+    return mniw.regression_statistics(samples.x - x_mean, samples.y - y_mean, weights=samples.live)
 
 
 def _neighbourhood(horizon: int, strengths: Strengths) -> Float[Tensor, "T T"]:
@@ -188,18 +188,24 @@ def _pooled(own: mniw.RegressionStatistics, weight: Tensor) -> mniw.RegressionSt
     return mniw.RegressionStatistics(*(torch.einsum("ts,s...->t...", weight, part) for part in own))
 
 
-def _posterior(
-    sources: _Sources, strengths: Strengths, x: Float[Tensor, "T N p"], y: Float[Tensor, "T N d"]
-) -> Increments:
+def _posterior(sources: _Sources, strengths: Strengths, samples: Transitions) -> Increments:
     """The point estimate of every time step: appendix B is a sum in natural parameters."""
-    own = _centred_statistics(x, y)
-    natural = _pooled(own, _neighbourhood(len(x), strengths)).plus(sources.ridge)
+    own = _centred_statistics(samples)
+    natural = _pooled(own, _neighbourhood(len(own.n), strengths)).plus(sources.ridge)
     for source, counts in ((sources.model, strengths.model), (sources.older, strengths.older)):
         if source is not None and counts:
             natural = natural.plus(source.scaled(counts))
     F, Sigma = mniw.point_estimate(mniw.standard(natural))
-    f = y.mean(dim=1) - (F @ x.mean(dim=1).unsqueeze(-1)).squeeze(-1)
-    return Increments(F, f, Sigma + LEAST_VARIANCE * torch.eye(y.shape[-1]).to(y))
+    x_mean, y_mean = samples.means()
+    f = y_mean[:, 0] - (F @ x_mean.mT).squeeze(-1)
+    return _increments(F, f, Sigma, samples)
+
+
+def _increments(F: Tensor, f: Tensor, Sigma: Tensor, samples: Transitions) -> Increments:
+    """Bounded below, and held from the last time step that has a sample."""
+    Sigma = Sigma + LEAST_VARIANCE * torch.eye(Sigma.shape[-1]).to(Sigma)
+    times = torch.arange(len(samples.live)).clamp(max=samples.sampled - 1)
+    return Increments(F[times], f[times], Sigma[times])
 
 
 def _grid(sources: _Sources, settings: LocalFit) -> list[Strengths]:
@@ -220,36 +226,37 @@ def _log_density(
     """log N(residual | 0, Sigma)."""
     factor = torch.linalg.cholesky(Sigma)
     white = torch.linalg.solve_triangular(factor, residual.mT, upper=False)
-    log_determinant = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(dim=-1)
+    log_determinant = cholesky.log_determinant(factor)[:, None]
     constant = residual.shape[-1] * math.log(2 * math.pi)
-    density: Tensor = -0.5 * (white.square().sum(dim=-2) + log_determinant[:, None] + constant)
+    density: Tensor = -0.5 * (white.square().sum(dim=-2) + log_determinant + constant)
     return density
 
 
-def _regression(x: Float[Tensor, "T N p"], y: Float[Tensor, "T N d"]) -> Increments:
+def _regression(samples: Transitions) -> Increments:
     """Least squares per time step, without a prior."""
-    one = torch.ones_like(x[..., :1])
+    x, y, live = samples
+    one = live.unsqueeze(-1)
     solution = torch.linalg.lstsq(torch.cat([x, one], dim=-1), y, driver="gelsd").solution
     F, f = solution[:, :-1].mT, solution[:, -1]
-    residual = y - x @ F.mT - f.unsqueeze(1)
-    Sigma = residual.mT @ residual / x.shape[1]
-    return Increments(F, f, Sigma + LEAST_VARIANCE * torch.eye(y.shape[-1]).to(y))
+    residual = (y - x @ F.mT - f.unsqueeze(1)) * one
+    Sigma = residual.mT @ residual / samples.counts[:, None, None]
+    return _increments(F, f, Sigma, samples)
 
 
 def _mixture_prior(
-    past: Sequence[Pairs], streams: Streams, x: Float[Tensor, "T N p"], y: Float[Tensor, "T N d"]
+    past: Sequence[Transitions], streams: Streams, samples: Transitions
 ) -> Increments:
     """LQR-FLM's fit (Levine and Abbeel 2014): a Gaussian mixture is the prior of every step.
 
     The mixture sees older batches too, as in the authors' release of guided policy search.
     """
-    points = torch.cat([x, y], dim=-1)
-    seen = [points.flatten(0, 1), *(torch.cat(pairs, dim=-1).flatten(0, 1) for pairs in past)]
-    flat = torch.cat(seen)
+    seen = [torch.cat([batch.x, batch.y], dim=-1)[batch.live > 0] for batch in (samples, *past)]
+    flat, sampled = torch.cat(seen), samples.sampled
     fit = gmm.fit_mixture(flat, gmm.cluster_count(len(flat)), streams.generator("mixture"))
-    joint = gmm.fit_joint(points, gmm.local_prior(fit.mixture, points))
-    F, f, Sigma = gmm.condition_joint(joint, x.shape[-1])
-    return Increments(F, f, Sigma + LEAST_VARIANCE * torch.eye(y.shape[-1]).to(y))
+    points, live = torch.cat([samples.x, samples.y], dim=-1)[:sampled], samples.live[:sampled]
+    joint = gmm.fit_joint(points, gmm.local_prior(fit.mixture, points, live), live)
+    F, f, Sigma = gmm.condition_joint(joint, samples.x.shape[-1])
+    return _increments(F, f, Sigma, samples)
 
 
 def _whole(increments: Increments, newest: Trajectories, prior: LatentPrior) -> LinearDynamics:

@@ -3,14 +3,18 @@
 The action's part is known; L, c and b minimise the squared error of observed costs. L has a
 positive diagonal, so that C = L L^T is positive definite. Fits run in whitened latents and
 standardised costs, where one optimiser setting serves every task.
+
+Axes: N episodes, T horizon, n samples of a fit, m features of z, q monomials of them. The leading
+axis k is of fits that are made at once: T, or none.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from solar_cli.control.linear_gaussian import QuadraticCost
@@ -24,7 +28,7 @@ PULL = 1e-3  # of a fit per time step towards the global one, on standardised co
 
 
 class _Quadratic(NamedTuple):
-    """Parameters of one or several fits over m features of z."""
+    """Parameters of one or several fits."""
 
     L: Float[Tensor, "*k m m"]
     c: Float[Tensor, "*k m"]
@@ -35,14 +39,39 @@ class _Quadratic(NamedTuple):
         diagonal = torch.diagonal(self.L, dim1=-2, dim2=-1)
         return self.L.tril(-1) + torch.diag_embed(torch.nn.functional.softplus(diagonal))
 
+    def coefficients(self) -> Float[Tensor, "*k q"]:
+        """Weights of `_monomials`."""
+        cholesky = self.cholesky()
+        C = cholesky @ cholesky.mT
+        pairs = torch.tril_indices(*C.shape[-2:])
+        halves = torch.where(pairs[0] == pairs[1], 0.5, 1.0).to(C)
+        return torch.cat([halves * C[..., *pairs], self.c, self.b.unsqueeze(-1)], dim=-1)
+
     def value(self, z: Float[Tensor, "*k n m"]) -> Float[Tensor, "*k n"]:
         """The quadratic form at every sample."""
-        half = z @ self.cholesky()
-        return (
-            0.5 * half.square().sum(dim=-1)
-            + (z @ self.c.unsqueeze(-1)).squeeze(-1)
-            + self.b.unsqueeze(-1)
+        return (_monomials(z) @ self.coefficients().unsqueeze(-1)).squeeze(-1)
+
+
+def _monomials(z: Float[Tensor, "*k n m"]) -> Float[Tensor, "*k n q"]:
+    """[z_i z_j for j <= i; z; 1]: a quadratic is linear in them."""
+    i, j = torch.tril_indices(z.shape[-1], z.shape[-1])
+    return torch.cat([z[..., i] * z[..., j], z, torch.ones_like(z[..., :1])], dim=-1)
+
+
+class _Moments(NamedTuple):
+    """Means over the samples of one or several fits: all that a squared error needs of them."""
+
+    xx: Float[Tensor, "*k q q"]
+    xy: Float[Tensor, "*k q"]
+    yy: Float[Tensor, "*k"]
+
+    def error(self, quadratic: _Quadratic) -> Float[Tensor, "*k"]:
+        """Mean squared error."""
+        w = quadratic.coefficients()
+        explained: Tensor = (w * (torch.einsum("...ij,...j->...i", self.xx, w) - 2 * self.xy)).sum(
+            dim=-1
         )
+        return explained + self.yy
 
 
 class FittedCost(NamedTuple):
@@ -64,26 +93,27 @@ def fit_quadratic_cost(
     The cost of the last state, which is never observed, is the last fit's times
     ``settings.terminal``.
     """
-    z = states.z[:, :-1, :features]
+    z, live = states.z[:, :-1, :features], states.live
     y = states.costs - action_cost * states.actions.square().sum(dim=-1)
-    scale = y.std().clamp_min(1e-9)
-    target = (y - y.mean()) / scale
+    mean, scale = y[live].mean(), y[live].std().clamp_min(1e-9)
+    target = (y - mean) / scale
     held_out = torch.arange(len(z)) % 5 == 4
     if len(z) < 5:
         held_out = torch.arange(len(z)) == len(z) - 1
     fit, judge = ~held_out, held_out
-    shared = _fit_shared(z[fit], target[fit], settings)
-    r2 = _r2(shared.value(z[judge].flatten(0, 1)), target[judge].flatten())
+    shared = _fit_shared(z[fit], target[fit], live[fit], settings)
+    judged, observed = live[judge], target[judge][live[judge]]
+    r2 = _r2(shared.value(z[judge][judged]), observed)
     per_time = False
     if settings.per_time == "chosen":
-        each = _fit_each(z[fit], target[fit], shared, settings)
+        each = _fit_each(z[fit], target[fit], live[fit], shared, settings)
         predicted = each.value(z[judge].transpose(0, 1)).transpose(0, 1)
-        each_r2 = _r2(predicted.flatten(), target[judge].flatten())
+        each_r2 = _r2(predicted[judged], observed)
         per_time, r2 = each_r2 > r2, max(r2, each_r2)
-    best = _fit_shared(z, target, settings)
+    best = _fit_shared(z, target, live, settings)
     if per_time:
-        best = _fit_each(z, target, best, settings)
-    model = _assembled(best, states, action_cost, y.mean(), scale, settings.terminal)
+        best = _fit_each(z, target, live, best, settings)
+    model = _assembled(best, states, action_cost, mean, scale, settings.terminal)
     return FittedCost(model, r2, per_time)
 
 
@@ -92,7 +122,7 @@ def explained(model: QuadraticCost, states: Trajectories) -> float:
     x = torch.cat([states.z[:, :-1], states.actions], dim=-1)
     quadratic = 0.5 * torch.einsum("nti,tij,ntj->nt", x, model.C[:-1], x)
     predicted = quadratic + torch.einsum("nti,ti->nt", x, model.c[:-1]) + model.b[:-1]
-    return _r2(predicted, states.costs)
+    return _r2(predicted[states.live], states.costs[states.live])
 
 
 def _r2(predicted: Tensor, observed: Tensor) -> float:
@@ -102,50 +132,66 @@ def _r2(predicted: Tensor, observed: Tensor) -> float:
     return float(1 - residual / spread) if spread > 1e-18 else 1.0
 
 
+def _moments(
+    z: Float[Tensor, "N T m"], target: Float[Tensor, "N T"], live: Bool[Tensor, "N T"]
+) -> _Moments:
+    """Sums over the episodes that were still running, over N, for every time step."""
+    over, count = ~live.T, len(z)
+    x = _monomials(z.transpose(0, 1)).masked_fill(over.unsqueeze(-1), 0.0)
+    y = target.T.masked_fill(over, 0.0)
+    xy = (x.mT @ y.unsqueeze(-1)).squeeze(-1)
+    return _Moments(x.mT @ x / count, xy / count, y.square().mean(dim=1))
+
+
 def _fit_shared(
-    z: Float[Tensor, "N T m"], target: Float[Tensor, "N T"], settings: CostFit
+    z: Float[Tensor, "N T m"],
+    target: Float[Tensor, "N T"],
+    live: Bool[Tensor, "N T"],
+    settings: CostFit,
 ) -> _Quadratic:
     m = z.shape[-1]
     start = _Quadratic(
-        torch.zeros(m, m, dtype=z.dtype, device=z.device) - 1.0 * torch.eye(m, device=z.device),
+        torch.zeros(m, m, dtype=z.dtype, device=z.device) - torch.eye(m, device=z.device),
         torch.zeros(m, dtype=z.dtype, device=z.device),
         torch.zeros((), dtype=z.dtype, device=z.device),
     )
-    flat, y = z.flatten(0, 1), target.flatten()
-    return _minimise(start, lambda q: (q.value(flat) - y).square().mean(), settings)
+    share = live.to(z).mean()
+    moments = _Moments(*(part.mean(dim=0) / share for part in _moments(z, target, live)))
+    return _minimise(start, moments.error, settings)
 
 
 def _fit_each(
     z: Float[Tensor, "N T m"],
     target: Float[Tensor, "N T"],
+    live: Bool[Tensor, "N T"],
     shared: _Quadratic,
     settings: CostFit,
 ) -> _Quadratic:
-    """One fit a time step; samples of neighbouring steps count with a Gaussian weight."""
+    """One fit a time step; samples of neighbouring steps count with a Gaussian weight.
+
+    A time step far from all samples gets the shared fit.
+    """
     horizon = z.shape[1]
     times = torch.arange(horizon, device=z.device)
+    distance = (times[:, None] - times).abs()
     reach = max(1, round(2 * settings.width))
-    offsets = torch.arange(-reach, reach + 1, device=z.device)
-    near = times[:, None] + offsets
-    inside = (near >= 0) & (near < horizon)
-    weight = torch.exp(-0.5 * (offsets / settings.width).square()) * inside
-    weight = (weight / weight.sum(dim=1, keepdim=True)).to(z.dtype)
-    near = near.clamp(0, horizon - 1)
-    # (T, neighbours x N, m): every time step sees its own and its neighbours' samples.
-    samples = z[:, near].permute(1, 2, 0, 3).flatten(1, 2)
-    observed = target[:, near].permute(1, 2, 0).flatten(1, 2)
-    weights = weight.repeat_interleave(len(z), dim=1) / len(z)
+    weight = torch.exp(-0.5 * (distance / settings.width).square()) * (distance <= reach)
+    total = (weight * live.to(weight).mean(dim=0)).sum(dim=1, keepdim=True)
+    weight = (weight / torch.where(total > 0, total, 1.0)).to(z.dtype)
+    own = _moments(z, target, live)
+    moments = _Moments(*(torch.einsum("ts,s...->t...", weight, part) for part in own))
     start = _Quadratic(*(part.expand(horizon, *part.shape).clone() for part in shared))
 
     def objective(q: _Quadratic) -> Tensor:
-        error = (weights * (q.value(samples) - observed).square()).sum()
         pull = sum((a - b).square().sum() for a, b in zip(q, shared, strict=True))
-        return error + PULL * pull
+        return moments.error(q).sum() + PULL * pull
 
     return _minimise(start, objective, settings)
 
 
-def _minimise(start: _Quadratic, objective, settings: CostFit) -> _Quadratic:  # type: ignore[no-untyped-def]
+def _minimise(
+    start: _Quadratic, objective: Callable[[_Quadratic], Tensor], settings: CostFit
+) -> _Quadratic:
     parameters = [part.detach().clone().requires_grad_() for part in start]
     quadratic = _Quadratic(*parameters)
     optimiser: torch.optim.Optimizer

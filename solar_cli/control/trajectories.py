@@ -5,10 +5,40 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from solar_cli.episodes import Episodes
+
+
+class Transitions(NamedTuple):
+    """Samples of each time step's dynamics; x and y are zero where an episode had ended."""
+
+    x: Float[Tensor, "T N p"]
+    """[z_t; a_t]"""
+    y: Float[Tensor, "T N d"]
+    """increments of the newest block of d entries"""
+    live: Float[Tensor, "T N"]
+    """1, or 0 where an episode had ended"""
+
+    def of(self, episodes: Tensor) -> Transitions:
+        """Those of some episodes."""
+        return Transitions(*(part[:, episodes] for part in self))
+
+    @property
+    def sampled(self) -> int:
+        """Time steps that have samples: the first ones."""
+        return int(self.live.any(dim=1).sum())
+
+    @property
+    def counts(self) -> Float[Tensor, " T"]:
+        """Samples of each time step; 1, to divide by, where there is none."""
+        return self.live.sum(dim=1).clamp_min(1.0)
+
+    def means(self) -> tuple[Float[Tensor, "T 1 p"], Float[Tensor, "T 1 d"]]:
+        """Of each time step."""
+        counts = self.counts[:, None, None]
+        return self.x.sum(dim=1, keepdim=True) / counts, self.y.sum(dim=1, keepdim=True) / counts
 
 
 class Trajectories(NamedTuple):
@@ -20,6 +50,23 @@ class Trajectories(NamedTuple):
     action_means: Float[Tensor, "N T a"]
     """without noise"""
     costs: Float[Tensor, "N T"]
+    live: Bool[Tensor, "N T"]
+    """whether an episode was still running: other steps are not learned from"""
+
+    @property
+    def planned(self) -> int:
+        """Time steps that two episodes lived at least: what a fit has to go by."""
+        return int((self.live.sum(dim=0) >= 2).sum())
+
+    @property
+    def reached(self) -> int:
+        """Time steps that at least half of the episodes lived."""
+        return int((2 * self.live.sum(dim=0) >= len(self.live)).sum())
+
+    def until(self, steps: int) -> Trajectories:
+        """The first time steps."""
+        first = (part[:, :steps] for part in self[1:])
+        return Trajectories(self.z[:, : steps + 1], *first)
 
     @staticmethod
     def of(z: Float[Tensor, "N T1 z"], episodes: Episodes) -> Trajectories:
@@ -29,9 +76,13 @@ class Trajectories(NamedTuple):
             torch.from_numpy(episodes.actions),
             torch.from_numpy(episodes.action_means),
             torch.from_numpy(episodes.costs),
+            torch.from_numpy(episodes.live_steps),
         )
 
-    def increments(self, d: int) -> tuple[Float[Tensor, "T N p"], Float[Tensor, "T N d"]]:
-        """Regressors x_t = [z_t; a_t] and increments of the newest block of d entries."""
+    def transitions(self, d: int) -> Transitions:
+        """Regressors and increments of the newest block of d entries."""
         x = torch.cat([self.z[:, :-1], self.actions], dim=-1)
-        return x.transpose(0, 1), self.z.diff(dim=1)[..., :d].transpose(0, 1)
+        y = self.z.diff(dim=1)[..., :d]
+        over = ~self.live.unsqueeze(-1)
+        parts = x.masked_fill_(over, 0.0), y.masked_fill_(over, 0.0), self.live.to(x)
+        return Transitions(*(part.transpose(0, 1) for part in parts))

@@ -19,6 +19,16 @@ from solar_cli.control.linear_gaussian import (
 from solar_cli.control.step_size import StepSize
 from solar_cli.episodes import Episodes
 
+LEAST_PROMISE = 0.05
+"""Share of what has been gained so far below which an update is tried before it is handed over: a
+model is no better than that, and the update may lose much (car: 0.2 to 2.0 for a promise of 1 %)
+"""
+
+
+NEXT_TO_NOTHING = 0.02
+"""Share of what has been gained so far by which a batch may always be worse than the best: where
+episodes hardly differ, their noise is so small that nothing would ever be built upon again."""
+
 
 class Anchor(NamedTuple):
     """A policy that was tried, the iteration that holds its episodes, and what they cost."""
@@ -51,30 +61,45 @@ class TrustRegion:
     """fall of the cost that was measured for it"""
     rejected: bool = False
     """whether the last policy was worse than the best, and taken back"""
+    first: float = math.nan
+    """cost of the first policy, which knows nothing"""
 
     def judged(self, tried: Anchor, tolerance: float | Literal["never"]) -> TrustRegion:
         """Build upon what was just tried, or go back to the best; the step is adapted."""
         if self.best is None or self.current is None:
-            return replace(self, best=tried, current=tried)
+            return replace(self, best=tried, current=tried, first=tried.cost)
         kept = self.current.cost - tried.cost
-        margin = math.hypot(tried.error, self.best.error)
-        if tolerance != "never" and tried.cost > self.best.cost + tolerance * margin:
+        if tolerance != "never" and tried.cost > self.best.cost + self._margin(tried, tolerance):
             step = self.step.after_rejection()
             return replace(self, current=self.best, step=step, kept=kept, rejected=True)
+        step = self.step.after(self.promised, kept)
+        if step.multiplier > self.step.multiplier and not self.trusts(self.promised):
+            step = self.step  # what is left to gain is small: no larger step is needed
         return replace(
             self,
-            step=self.step.after(self.promised, kept),
+            step=step,
             best=tried if tried.cost < self.best.cost else self.best,
             current=tried,
             kept=kept,
             rejected=False,
         )
 
+    def _margin(self, tried: Anchor, tolerance: float) -> float:
+        """By how much a batch may be worse than the best: its noise, or next to nothing."""
+        assert self.best is not None
+        noise = tolerance * math.hypot(tried.error, self.best.error)
+        return max(noise, NEXT_TO_NOTHING * (self.first - self.best.cost))
+
     @property
     def built_upon(self) -> Anchor:
         """What the next update starts from; there is none before a first policy was judged."""
         assert self.current is not None
         return self.current
+
+    def trusts(self, promised: float) -> bool:
+        """Whether an update that promises this fall of the cost may be handed over untried."""
+        assert self.best is not None
+        return promised >= LEAST_PROMISE * (self.first - self.best.cost)
 
     def metrics(self) -> dict[str, float]:
         """What the last update promised and gave, once there was one, and what follows."""
@@ -92,6 +117,7 @@ class TrustRegion:
             "best": _plain(self.best),
             "current": _plain(self.current),
             "promised": self.promised,
+            "first": self.first,
         }
 
     def restored(self, state: dict[str, Any]) -> TrustRegion:
@@ -102,6 +128,7 @@ class TrustRegion:
             best=_anchor(state["best"]),
             current=_anchor(state["current"]),
             promised=state["promised"],
+            first=state["first"],
         )
 
 

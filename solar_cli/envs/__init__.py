@@ -1,6 +1,6 @@
 """Simulators, batched over episodes: one interface for every task (`solar_cli.envs.task`).
 
-A simulator is a module with two functions, ``build(settings) -> Task`` and
+A simulator is a module with two functions, ``build(settings) -> Restartable`` and
 ``picture(frames, factor) -> (..., H factor, W factor, 3)`` in [0, 1], and a line in `SIMULATORS`.
 """
 
@@ -12,19 +12,25 @@ from types import ModuleType
 import numpy as np
 from numpy.typing import NDArray
 
-from solar_cli.envs.task import Frames, Task
+from solar_cli.envs.task import Frames, Restartable, Task
 from solar_cli.errors import UsageError, nearest
 from solar_cli.settings import TaskSettings
 
 __all__ = ["SIMULATORS", "Task", "build_task", "picture"]
 
-SIMULATORS = {"navigation": "solar_cli.envs.navigation"}
+SIMULATORS = {
+    "gymnasium": "solar_cli.envs.gymnasium_task",
+    "navigation": "solar_cli.envs.navigation",
+    "car": "solar_cli.envs.car",
+    "reacher": "solar_cli.envs.reacher",
+    "sawyer": "solar_cli.envs.sawyer",
+}
 """name on a card -> module, imported when used"""
 
 
-def build_task(settings: TaskSettings) -> Task:
+def build_task(settings: TaskSettings) -> Restartable:
     """The task that ``settings`` describe. Raises `UsageError` for what its simulator lacks."""
-    task: Task = _simulator(settings).build(settings)
+    task: Restartable = _simulator(settings).build(settings)
     return task
 
 

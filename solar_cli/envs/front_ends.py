@@ -20,15 +20,21 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from solar_cli.envs import build_task, picture
-from solar_cli.envs.task import Frames, RowTask
-from solar_cli.errors import UsageError
+from solar_cli.envs.task import Frames
 from solar_cli.settings import TaskSettings, load_card
 from solar_cli.settings.card import card_folders
 
 Array = NDArray[Any]
 Info = dict[str, Any]
 
-IDS = {"Solar/Navigation-v0": "nav", "Solar/NavigationFixed-v0": "nav-fixed"}
+IDS = {
+    "Solar/Navigation-v0": "nav",
+    "Solar/NavigationFixed-v0": "nav-fixed",
+    "Solar/Car-v0": "car",
+    "Solar/CarStates-v0": "car-states",
+    "Solar/Reacher-v0": "reacher",
+    "Solar/Sawyer-v0": "sawyer",
+}
 """Gymnasium id -> card"""
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}
 
@@ -48,10 +54,7 @@ class _Core:
 
     def __init__(self, card: str) -> None:
         self.settings = task_settings(card)
-        task = build_task(self.settings)
-        if not isinstance(task, RowTask):
-            raise UsageError(f"task {card!r} has no Gymnasium form: its simulator is not our own")
-        self.task = task
+        self.task = build_task(self.settings)
         seen, bound = self.settings.observation, self.settings.action.bound
         shape = (seen.window * seen.frame_shape[0], *seen.frame_shape[1:])
         self.observation_space = (
@@ -59,7 +62,7 @@ class _Core:
             if seen.kind == "image"
             else spaces.Box(-np.inf, np.inf, shape, np.float32)
         )
-        self.action_space = spaces.Box(-bound, bound, (task.action_size,), np.float32)
+        self.action_space = spaces.Box(-bound, bound, (self.task.action_size,), np.float32)
         self._windows: Array = np.empty((0, seen.window, *seen.frame_shape))
 
     def reset(self, streams: Sequence[np.random.Generator]) -> None:

@@ -32,6 +32,7 @@ class Checkpoints:
         self._cell = cell
         self._attempt = attempt
         self._folder = store.folder(cell)
+        self._milestones = store.find(cell).cell.configuration.evaluation.milestones
         self.damaged: list[str] = []
         """what `restore` had to say about damaged files"""
 
@@ -72,10 +73,16 @@ class Checkpoints:
         return CheckpointRecord(path, sha256, size, iteration, episodes, position, complete)
 
     def trim(self) -> None:
-        """Forget all but the newest ones and the best by training cost."""
+        """Forget all but the newest ones, the best by training cost, and those of milestones."""
         known = self._store.checkpoints(self._cell)
         best = best_iteration(self._store, self._cell)
-        keep = known[:NEWEST] + [r for r in known if r.complete and r.iteration == best]
+        complete = [record for record in known if record.complete]
+        # The policy of the newest complete one is still being tried, and may be the best.
+        keep = known[:NEWEST] + complete[:1]
+        keep += [record for record in complete if record.iteration == best]
+        for milestone in self._milestones:
+            reached = [record for record in complete if record.episodes >= milestone]
+            keep += reached[-1:]  # the oldest: known ones come newest first
         self._keep(keep)
 
     def _keep(self, records: Sequence[CheckpointRecord]) -> None:

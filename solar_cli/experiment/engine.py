@@ -35,8 +35,6 @@ ENVIRONMENT = {
     # A crash in native code leaves its stack in the log.
     "PYTHONFAULTHANDLER": "1",
 }
-PREFERRED = {"MUJOCO_GL": "egl"}
-"""set unless the user has: which of the GL libraries is there depends on the machine"""
 
 
 @dataclass(frozen=True)
@@ -182,4 +180,4 @@ def _environment(own: Mapping[str, str], order: Order) -> dict[str, str]:
     # The database goes this way because every user can read the arguments of every process, and an
     # address may hold a password.
     where = {"SOLAR_DB": order.address, "SOLAR_HOME": str(order.home)}
-    return {**PREFERRED, **own, **ENVIRONMENT, **where}
+    return {**own, **ENVIRONMENT, **where}

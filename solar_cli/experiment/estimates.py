@@ -1,7 +1,11 @@
-"""What cells will take, judged by finished cells of the same task, method and variant."""
+"""What cells will take: judged by finished cells of the same task, method and variant, and by size.
+
+`memory_needs` counts arrays that no run of a cell can do without, from its settings alone.
+"""
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -10,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from solar_cli.experiment.matrix import Action, Plan
 from solar_cli.settings import Cell
+from solar_cli.settings.local import LocalMethod
 from solar_cli.store.records import CellRecord, State
 
 if TYPE_CHECKING:
@@ -17,6 +22,7 @@ if TYPE_CHECKING:
 
 WORKER_BYTES = 2**30
 """memory that a worker is counted with: what a cell may take at its peak"""
+FLOAT_BYTES = 8
 Kind = tuple[str, str, str]
 """task, method, variant"""
 
@@ -28,6 +34,43 @@ class Estimate:
     seconds: float | None
     memory_bytes: int
     disk_bytes: int | None
+
+
+@dataclass(frozen=True)
+class Need:
+    """Arrays that a cell holds in memory, whatever else it does."""
+
+    bytes: int
+    what: str
+    settings: tuple[str, ...]
+    """paths of those that make it large"""
+
+
+def memory_needs(cell: Cell) -> list[Need]:
+    """What a worker holds at one time, at least: a lower bound, made of the cell's settings.
+
+    Episodes of the last evaluation and of the first batch; of a local method a matrix over states
+    for each time step, and the weights of all pairs of time steps that posterior inference uses.
+    """
+    task, method = cell.configuration.task, cell.configuration.method
+    judged = cell.configuration.evaluation.episodes
+    seen, frames = task.observation, task.horizon + 1
+    frame = math.prod(seen.frame_shape) * (1 if seen.kind == "image" else 4)  # uint8, float32
+    # Actions, what they would have been without noise, and a cost.
+    episode = frames * frame + task.horizon * (2 * task.action.size + 1) * FLOAT_BYTES
+    sizes = ("task.horizon", "task.observation")
+    needs = [Need(judged * episode, "an evaluation", ("evaluation.episodes", *sizes))]
+    if isinstance(method, LocalMethod):
+        prefix, states = f"methods.{cell.method}", method.representation.latent * seen.window
+        batch, batches = max(method.batches.initial, method.batches.noisy), f"{prefix}.batches"
+        needs.append(Need(batch * episode, "a batch of episodes", (batches, *sizes)))
+        matrices = task.horizon * states**2 * FLOAT_BYTES
+        latent = f"{prefix}.representation.latent"
+        needs.append(Need(matrices, "dynamics of latent states", (latent, "task.horizon")))
+        if method.local_fit.method == "posterior":
+            pairs = task.horizon**2 * FLOAT_BYTES
+            needs.append(Need(pairs, "weights of neighbouring time steps", ("task.horizon",)))
+    return needs
 
 
 def kind_of(cell: Cell) -> Kind:
@@ -62,7 +105,8 @@ def _estimate(plan: Plan, speeds: dict[Kind, float], sizes: dict[Kind, float]) -
     missing = max(0, plan.target - kept)
     seconds = speeds[kind] * missing if kind in speeds else None
     disk = round(sizes[kind] * plan.target) if kind in sizes else None
-    return Estimate(seconds, WORKER_BYTES, disk)
+    memory = sum(need.bytes for need in memory_needs(plan.cell))
+    return Estimate(seconds, max(WORKER_BYTES, memory), disk)
 
 
 def _finished(store: Store, cells: Sequence[Cell]) -> dict[Kind, list[CellRecord]]:

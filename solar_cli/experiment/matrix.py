@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from solar_cli.experiment.provenance import code, code_name, same_code
 from solar_cli.settings import Cell
 from solar_cli.store.records import CellRecord, State
+from solar_cli.wording import counted
 
 if TYPE_CHECKING:
     from solar_cli.store.store import Store
@@ -100,9 +101,10 @@ def _decide(
     owner = record.last_attempt.owner
     if record.state is State.RUNNING:
         return Action.BLOCKED, f"runs on {owner.host}, process {owner.pid}"
+    had = counted(record.episodes, "episode")
     if redo:
-        return Action.REDO, f"--redo discards {record.episodes} episodes ({record.state.value})"
-    progress = f"iteration {record.iteration}, {record.episodes} of {target} episodes"
+        return Action.REDO, f"--redo discards {had} ({record.state.value})"
+    progress = f"iteration {record.iteration}, {record.episodes} of {counted(target, 'episode')}"
     if record.state is State.FINISHED:
         return _decide_finished(record, target, present)
     if record.state is State.INTERRUPTED:
@@ -120,13 +122,13 @@ def _decide_finished(
     by = code_name(record.last_attempt.provenance) if record.last_attempt else "unknown code"
     if record.episodes < target:
         other = f", computed by {by}" if stale else ""
-        return Action.CONTINUE, f"has {record.episodes} of {target} episodes{other}"
+        return Action.CONTINUE, f"has {record.episodes} of {counted(target, 'episode')}{other}"
     if stale:
         return (
             Action.STALE,
             f"computed by {by}, not by {code_name(present)}; --redo computes it anew",
         )
-    return Action.SKIP, f"finished with {record.episodes} episodes"
+    return Action.SKIP, f"finished with {counted(record.episodes, 'episode')}"
 
 
 def _verb(state: State) -> str:

@@ -12,7 +12,7 @@ import logging
 import math
 import resource
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, Protocol
 
@@ -26,12 +26,17 @@ from solar_cli.experiment.checkpointing import Checkpoints
 from solar_cli.experiment.exhibits import exhibit
 from solar_cli.experiment.judge import Judge, measured
 from solar_cli.experiment.messages import Message
+from solar_cli.experiment.stopwatch import Stopwatch
 from solar_cli.experiment.watched import WatchedTask
 from solar_cli.methods import Diverged, Learner
 from solar_cli.settings import Cell, load, method
 from solar_cli.store.records import CheckpointRecord, Metric
 from solar_cli.store.store import Store
 from solar_cli.streams import Streams
+from solar_cli.wording import counted
+
+TRAINING = ("seconds_training", "seconds_discarded")
+"""metrics of a method that trains networks: of what it kept, and of what it threw away"""
 
 log = logging.getLogger(__name__)
 
@@ -84,6 +89,7 @@ class Session:
         self._seconds = 0.0  # of computing, in earlier attempts
         self._began = self._saved = time.monotonic()
         self._unsaved = True  # something has come since the last checkpoint
+        self._watch = Stopwatch()  # of the iteration
         streams, task = Streams(cell.seed), cell.configuration.task
         self._checkpoints = Checkpoints(store, cell.hash, attempt)
         self._judge = Judge(cell, partial(self._pause, "evaluating"))
@@ -100,7 +106,7 @@ class Session:
     @property
     def place(self) -> str:
         """Where it stands, for a message about what went wrong there."""
-        return f"iteration {self._iteration}, {self.environment.episodes} episodes"
+        return f"iteration {self._iteration}, {counted(self.environment.episodes, 'episode')}"
 
     @property
     def notes(self) -> list[str]:
@@ -127,8 +133,11 @@ class Session:
             self._inside = True
         self.environment.begin(self._iteration)
         self._tell("starting")
+        experience = Experience(self.environment)
+        experience.collect = self._watch.running("collecting")(experience.collect)
         try:
-            learned = self.learner.iterate(Experience(self.environment))
+            with self._watch.running("control"):
+                learned = self.learner.iterate(experience)
         except (np.linalg.LinAlgError, torch.linalg.LinAlgError) as error:  # type: ignore[attr-defined]
             # What numbers that are no longer finite look like to a factorisation.
             raise Diverged(str(error)) from error
@@ -142,18 +151,31 @@ class Session:
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
         metrics.append(Metric("peak_memory_bytes", peak))
         _require_finite_return(metrics)
-        self._evaluation = self._judge.evaluate(self.learner.policy, self._iteration)
-        judged = measured(self._evaluation)
-        _require_finite_return(judged)
-        if self._iteration > 0:
-            diagnosed = self.learner.diagnose(self._evaluation)
-            metrics += [Metric(name, value, "model") for name, value in diagnosed.items()]
+        with self._watch.running("evaluating"):
+            self._evaluation = self._judge.evaluate(self.learner.policy, self._iteration)
+            judged = measured(self._evaluation)
+            _require_finite_return(judged)
+            if self._iteration > 0:
+                diagnosed = self.learner.diagnose(self._evaluation)
+                metrics += [Metric(name, value, "model") for name, value in diagnosed.items()]
         headline = self._cell.configuration.evaluation.headline
         self._headline = {metric.name: metric.value for metric in judged}.get(headline)
         self._episodes = self.environment.episodes
         self._inside, self._learned = False, None
-        self._commit(metrics + judged, self._save() if self._iteration > 0 else None)
+        checkpoint = self._save() if self._iteration > 0 else None
+        self._commit(metrics + judged + self._timings(train), checkpoint)
         log.info("%s: %s %s", self.place, headline, self._headline)
+
+    def _timings(self, train: Mapping[str, float]) -> list[Metric]:
+        """Seconds of the iteration by activity, those of training aside, which the method measures.
+
+        Control is all else that it does. Saving is that of checkpoints, and the commit before.
+        """
+        seconds = self._watch.seconds()
+        self._watch.go_on_from({})
+        if "control" in seconds:
+            seconds["control"] -= sum(train.get(name, 0.0) for name in TRAINING)
+        return [Metric(f"seconds_{activity}", value) for activity, value in seconds.items()]
 
     def _exhibit(self) -> None:
         """Keep what the report shows of the final policy."""
@@ -206,16 +228,18 @@ class Session:
             "episodes": self._episodes,
             "headline": self._headline,
             "seconds": self._computed(),
+            "spent": self._watch.seconds() if self._inside else {},
             "environment": self.environment.state_dict(),
             "learner": self.learner.state_dict(),
         }
-        record = self._checkpoints.save(
-            state,
-            self._iteration,
-            self.environment.episodes,
-            self._position,
-            complete=not self._inside,
-        )
+        with self._watch.running("saving"):
+            record = self._checkpoints.save(
+                state,
+                self._iteration,
+                self.environment.episodes,
+                self._position,
+                complete=not self._inside,
+            )
         self._position += 1
         self._saved, self._unsaved = time.monotonic(), False
         return record
@@ -224,19 +248,20 @@ class Session:
         """One transaction. The supervisor is told first, so that an orphan writes nothing."""
         self._tell("saving")
         steps = self.environment.steps
-        self._store.commit(
-            self._cell.hash,
-            self._attempt,
-            iteration=self._iteration,
-            episodes=self.environment.episodes,
-            steps=steps,
-            simulated_seconds=steps * self._cell.configuration.task.step_seconds,
-            seconds=self._computed(),
-            metrics=metrics,
-            checkpoint=checkpoint,
-        )
-        if checkpoint is not None:
-            self._checkpoints.trim()
+        with self._watch.running("saving"):
+            self._store.commit(
+                self._cell.hash,
+                self._attempt,
+                iteration=self._iteration,
+                episodes=self.environment.episodes,
+                steps=steps,
+                simulated_seconds=steps * self._cell.configuration.task.step_seconds,
+                seconds=self._computed(),
+                metrics=metrics,
+                checkpoint=checkpoint,
+            )
+            if checkpoint is not None:
+                self._checkpoints.trim()
 
     def _restore(self) -> bool:
         """Take up the newest sound checkpoint; False where there is none."""
@@ -251,6 +276,7 @@ class Session:
         self._unsaved = False
         self._episodes, self._headline = state["episodes"], state["headline"]
         self._seconds = state["seconds"]
+        self._watch.go_on_from(state.get("spent", {}))
         log.info("going on from %s: %s", record.path, self.place)
         return True
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from solar_cli.envs.task import Floats, Frames, Task
 
@@ -20,6 +21,7 @@ class WatchedTask:
         self.action_size = task.action_size
         self.action_bound = task.action_bound
         self.truth_names = task.truth_names
+        self.at_once = task.at_once
         self._task = task
         self._progress = progress
         self._steps = 0
@@ -36,6 +38,10 @@ class WatchedTask:
         self._steps += 1
         self._progress(self._steps / self.horizon)
         return stepped
+
+    def ended(self) -> NDArray[np.bool_]:
+        """As `Task.ended`."""
+        return self._task.ended()
 
     def measures(self) -> dict[str, Floats]:
         """As `Task.measures`."""

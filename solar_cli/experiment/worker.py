@@ -165,6 +165,8 @@ def prepare_torch(device: str) -> str:
     torch.set_num_threads(1)
     torch.set_num_interop_threads(1)
     torch.use_deterministic_algorithms(True)
+    # Else every new tensor is filled with NaN first: a twentieth of a training.
+    torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
     available = torch.cuda.is_available()
     if device == "cuda" and not available:
         raise SolarError(

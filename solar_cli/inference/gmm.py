@@ -108,13 +108,21 @@ def responsibilities(
     return _log_joint(mixture, points.double()).softmax(-1)
 
 
-def local_prior(mixture: GaussianMixture, points: Float[Tensor, "T N D"]) -> LocalPrior:
-    """The moments of the clusters that explain the points of a time step."""
-    weights = responsibilities(mixture, points).mean(-2)
-    mu0 = weights @ mixture.means
+def local_prior(
+    mixture: GaussianMixture,
+    points: Float[Tensor, "T N D"],
+    weights: Float[Tensor, "T N"] | None = None,
+) -> LocalPrior:
+    """The moments of the clusters that explain the points of a time step.
+
+    ``weights`` counts points (0 masks one out).
+    """
+    w = torch.ones_like(points[..., 0]) if weights is None else weights.double()
+    shares = (responsibilities(mixture, points) * w[..., None]).sum(-2) / w.sum(-1)[:, None]
+    mu0 = shares @ mixture.means
     spread = mixture.means - mu0[:, None]
-    within = torch.einsum("tk,kij->tij", weights, mixture.covariances)
-    between = torch.einsum("tk,tki,tkj->tij", weights, spread, spread)
+    within = torch.einsum("tk,kij->tij", shares, mixture.covariances)
+    between = torch.einsum("tk,tki,tkj->tij", shares, spread, spread)
     freedom = (mixture.points - 2 - mu0.shape[-1]) / mixture.points
     return LocalPrior(
         mu0,
@@ -124,15 +132,21 @@ def local_prior(mixture: GaussianMixture, points: Float[Tensor, "T N D"]) -> Loc
     )
 
 
-def fit_joint(points: Float[Tensor, "T N D"], prior: LocalPrior) -> JointGaussian:
-    """The Gaussian of each time step's points under its prior; the mean is the points' own."""
+def fit_joint(
+    points: Float[Tensor, "T N D"], prior: LocalPrior, weights: Float[Tensor, "T N"] | None = None
+) -> JointGaussian:
+    """The Gaussian of each time step's points under its prior; the mean is the points' own.
+
+    ``weights`` counts points (0 masks one out).
+    """
     points = points.double()
-    count = points.shape[-2]
-    mean = points.mean(-2)
+    w = (torch.ones_like(points[..., 0]) if weights is None else weights.double())[..., None]
+    count = w.sum(-2)
+    mean = (points * w).sum(-2) / count
     deviation = points - mean[:, None]
-    shift = (mean - prior.mu0)[..., None]
+    shift, count = (mean - prior.mu0)[..., None], count[..., None]
     shrinkage = count * prior.m / (count + prior.m)
-    scatter = deviation.mT @ deviation + prior.Phi + shrinkage * shift @ shift.mT
+    scatter = (w * deviation).mT @ deviation + prior.Phi + shrinkage * shift @ shift.mT
     return JointGaussian(mean, scatter / (count + prior.n0))
 
 

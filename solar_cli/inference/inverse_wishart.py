@@ -27,20 +27,11 @@ def multivariate_digamma(x: Float[Tensor, "*batch"], d: int) -> Float[Tensor, "*
     return torch.digamma(x[..., None] - shifts).sum(-1)
 
 
-def log_normaliser(
-    Psi: Float[Tensor, "*batch d d"], nu: Float[Tensor, "*batch"]
-) -> Float[Tensor, "*batch"]:
-    """log Z of the density above."""
-    d = Psi.shape[-1]
-    return nu / 2 * (d * math.log(2) - log_determinant(Psi)) + torch.mvlgamma(nu / 2, d)
-
-
 def expected_log_det_precision(
-    Psi: Float[Tensor, "*batch d d"], nu: Float[Tensor, "*batch"]
+    log_det_Psi: Float[Tensor, "*batch"], d: int, nu: Float[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch"]:
     """E log|S^-1|."""
-    d = Psi.shape[-1]
-    return multivariate_digamma(nu / 2, d) - log_determinant(Psi) + d * math.log(2)
+    return multivariate_digamma(nu / 2, d) - log_det_Psi + d * math.log(2)
 
 
 def kl_divergence(

@@ -6,17 +6,14 @@ It is conjugate: pairs (x, y) add their sufficient statistics to its natural par
 (A, B, C, nu) = (Psi + M V^-1 M^T, M V^-1, V^-1, nu). ``RegressionStatistics`` holds either.
 In SOLAR y is the next latent and x = [z; a], or [z; a; 1] for an affine map (Eq. 2-3, 5).
 
-Axes: N samples, d outputs (latent), p regressors. Leading axes (time steps, folds) are batch axes.
-Functions that sum over samples take them on the axis before the last; functions of one sample
-broadcast the batch axes of the belief against the leading axes of the samples, so a belief a time
-step (T ...) meets samples (N T ...) as they are. Everything is computed in float64: conversions
-between the two forms lose half of the digits. Matrices that are not positive definite raise
-``torch.linalg.LinAlgError``.
+Axes: N samples, d outputs (latent), p regressors; samples are summed over the axis before the last.
+Leading axes (time steps, folds) are batch axes, and broadcast. Everything is computed in float64:
+conversions between the two forms lose half of the digits. Matrices that are not positive definite
+raise ``torch.linalg.LinAlgError``.
 """
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import torch
@@ -35,7 +32,12 @@ class RegressionStatistics(NamedTuple):
     n: Float[Tensor, "*batch"]
 
     def plus(self, other: RegressionStatistics) -> RegressionStatistics:
-        """The statistics of both sets of pairs; batch axes broadcast."""
+        """The statistics of both sets of pairs; batch axes broadcast.
+
+        Natural parameters of a prior plus statistics are those of the posterior: Bayesian linear
+        regression, appendix B, with nu_t = nu' + N and V_t = (V'^-1 + sum x x^T)^-1, which it
+        misprints.
+        """
         return RegressionStatistics(*(a + b for a, b in zip(self, other, strict=True)))
 
     def scaled(self, weight: float | Float[Tensor, "*batch"]) -> RegressionStatistics:
@@ -78,21 +80,20 @@ def standard(parameters: RegressionStatistics) -> MNIW:
     One Cholesky factor of [[C, B^T], [B, A]] gives Psi = A - B C^-1 B^T as a product of its lower
     right block, so Psi stays positive definite where the subtraction would not.
     """
-    A, B, C, nu = parameters
-    p = C.shape[-1]
-    joint = torch.cat([torch.cat([C, B.mT], -1), torch.cat([B, A], -1)], -2)
-    factor = torch.linalg.cholesky(joint)
+    p = parameters.xx.shape[-1]
+    factor = _joint_factor(parameters)
     L_xx, L_yx, L_yy = factor[..., :p, :p], factor[..., p:, :p], factor[..., p:, p:]
     M = torch.linalg.solve_triangular(L_xx, L_yx, upper=False, left=False)
     whitening = cholesky.inverse_factor(L_xx)
-    return MNIW(L_yy @ L_yy.mT, nu, M, whitening.mT @ whitening)
+    return MNIW(L_yy @ L_yy.mT, parameters.n, M, whitening.mT @ whitening)
 
 
-def log_normaliser(q: MNIW) -> Float[Tensor, "*batch"]:
-    """log Z of the joint density of (F, S), with all constants."""
-    d, p = q.M.shape[-2:]
-    columns = (inverse_wishart.log_determinant(q.V) + p * math.log(2 * math.pi)) * (d / 2)
-    return inverse_wishart.log_normaliser(q.Psi, q.nu) + columns
+def _joint_factor(parameters: RegressionStatistics) -> Float[Tensor, "*batch pd pd"]:
+    """The Cholesky factor of [[C, B^T], [B, A]]."""
+    A, B, C, _ = parameters
+    joint = torch.cat([torch.cat([C, B.mT], -1), torch.cat([B, A], -1)], -2)
+    factor: Tensor = torch.linalg.cholesky(joint)
+    return factor
 
 
 def kl_divergence(q: MNIW, p: MNIW) -> Float[Tensor, "*batch"]:
@@ -107,16 +108,22 @@ def kl_divergence(q: MNIW, p: MNIW) -> Float[Tensor, "*batch"]:
     return inverse_wishart.kl_divergence(q.Psi, q.nu, p.Psi, p.nu) + conditional
 
 
-def expected_statistics(q: MNIW) -> ExpectedStatistics:
-    """E_q of the precision, of its products with F, and of its log-determinant."""
-    d = q.Psi.shape[-1]
-    precision = q.nu[..., None, None] * cholesky.inverse(q.Psi)
-    precision_F = precision @ q.M
+def expected_statistics(parameters: RegressionStatistics) -> ExpectedStatistics:
+    """E_q of the precision, of its products with F, and of its log-determinant.
+
+    The lower rows of the inverse Cholesky factor of [[C, B^T], [B, A]] are Psi^-1/2 [-M, I].
+    """
+    d, p, nu = parameters.yy.shape[-1], parameters.xx.shape[-1], parameters.n
+    whitening = cholesky.inverse_factor(_joint_factor(parameters))
+    x, y = whitening[..., p:, :p], whitening[..., p:, p:]
+    columns = whitening[..., :p, :p]
+    scaled_y = nu[..., None, None] * y.mT
+    log_det_Psi = cholesky.log_determinant(y).neg()
     return ExpectedStatistics(
-        precision=precision,
-        precision_F=precision_F,
-        F_precision_F=q.M.mT @ precision_F + d * q.V,
-        log_det_precision=inverse_wishart.expected_log_det_precision(q.Psi, q.nu),
+        precision=scaled_y @ y,
+        precision_F=-(scaled_y @ x),
+        F_precision_F=nu[..., None, None] * (x.mT @ x) + d * (columns.mT @ columns),
+        log_det_precision=inverse_wishart.expected_log_det_precision(log_det_Psi, d, nu),
     )
 
 
@@ -127,47 +134,47 @@ def regression_statistics(
     y_variance: Float[Tensor, "*batch N d"] | None = None,
     weights: Float[Tensor, "*batch N"] | None = None,
 ) -> RegressionStatistics:
-    """Expected sufficient statistics of N pairs, summed over the sample axis.
+    """Expected sufficient statistics of N pairs, summed over the sample axis; differentiable.
 
     The variances are the diagonals of a mean-field q (Eq. 5), under which x and y are independent;
     ``weights`` counts pairs (0 masks one out).
     """
-    x, y = x.double(), y.double()
-    w = torch.ones_like(x[..., 0]) if weights is None else weights.double()
-    x_weighted, y_weighted = w[..., None] * x, w[..., None] * y
-    yy, yx, xx = y_weighted.mT @ y, y_weighted.mT @ x, x_weighted.mT @ x
-    if x_variance is not None:
-        xx = xx + torch.diag_embed((w[..., None] * x_variance.double()).sum(-2))
-    if y_variance is not None:
-        yy = yy + torch.diag_embed((w[..., None] * y_variance.double()).sum(-2))
+    joint = torch.cat([y.double(), x.double()], dim=-1)
+    w = torch.ones_like(joint[..., 0]) if weights is None else weights.double()
+    moments = (w[..., None] * joint).mT @ joint
+    if x_variance is not None or y_variance is not None:
+        spread = torch.cat(
+            [
+                torch.zeros_like(mean) if variance is None else variance.double()
+                for mean, variance in ((y, y_variance), (x, x_variance))
+            ],
+            dim=-1,
+        )
+        moments = moments + torch.diag_embed((w[..., None, :] @ spread).squeeze(-2))
+    d = y.shape[-1]
+    yy, yx, xx = moments[..., :d, :d], moments[..., :d, d:], moments[..., d:, d:]
     return RegressionStatistics(yy, yx, xx, w.sum(-1).expand(xx.shape[:-2]))
 
 
 def expected_transition_kl(
     expected: ExpectedStatistics,
-    y_mean: Float[Tensor, "*#sample d"],
-    y_variance: Float[Tensor, "*#sample d"],
-    x_mean: Float[Tensor, "*#sample p"],
-    x_variance: Float[Tensor, "*#sample p"],
-) -> Float[Tensor, "*sample"]:
-    """E_q(F,S) E_q(x) KL(N(y_mean, diag y_variance) || N(F x, S)) in nats, for each sample.
+    pairs: RegressionStatistics,
+    log_variance: Float[Tensor, "*batch"],
+) -> Float[Tensor, "*batch"]:
+    """Sum over pairs of E_q(F,S) E_q(x) KL(N(y_mean, diag y_variance) || N(F x, S)) in nats.
 
-    The latent KL term of the ELBO (section 3), with the uncertainty of F, S and x in it;
-    differentiable in means and variances. An exactly known regressor (a constant) has variance 0.
+    The latent KL term of the ELBO (section 3), with the uncertainty of F, S and x in it. ``pairs``
+    are the expected statistics of the pairs' mean-field factors, ``log_variance`` is the sum of the
+    logarithms of all y_variance; both weigh pairs alike. Differentiable in both.
     """
-    y_mean, y_variance = y_mean.double(), y_variance.double()
-    x_mean, x_variance = x_mean.double(), x_variance.double()
     precision, precision_F, F_precision_F, log_det_precision = expected
-    quadratic = (
-        _form(precision, y_mean, y_mean)
-        - 2 * _form(precision_F, y_mean, x_mean)
-        + _form(F_precision_F, x_mean, x_mean)
+    quadratic: Tensor = (
+        (precision * pairs.yy).sum((-2, -1))
+        - 2 * (precision_F * pairs.yx).sum((-2, -1))
+        + (F_precision_F * pairs.xx).sum((-2, -1))
     )
-    spread = (precision.diagonal(dim1=-2, dim2=-1) * y_variance).sum(-1) + (
-        F_precision_F.diagonal(dim1=-2, dim2=-1) * x_variance
-    ).sum(-1)
-    log_ratio = log_det_precision + y_variance.log().sum(-1)
-    return (quadratic + spread - log_ratio - y_mean.shape[-1]) / 2
+    constant = pairs.n * (log_det_precision + pairs.yy.shape[-1])
+    return (quadratic - constant - log_variance) / 2
 
 
 def natural_gradient_step(
@@ -185,14 +192,6 @@ def natural_gradient_step(
     """
     target = prior.plus(batch_statistics.scaled(scale))
     return current.scaled(1 - rate).plus(target.scaled(rate))
-
-
-def posterior(prior: MNIW, statistics: RegressionStatistics) -> MNIW:
-    """The belief after the data: Bayesian linear regression.
-
-    Appendix B, with nu_t = nu' + N and V_t = (V'^-1 + sum x x^T)^-1, which it misprints.
-    """
-    return standard(natural(prior).plus(statistics))
 
 
 def point_estimate(q: MNIW) -> tuple[Float[Tensor, "*batch d p"], Float[Tensor, "*batch d d"]]:
@@ -219,44 +218,3 @@ def centred(statistics: RegressionStatistics, constant: int) -> RegressionStatis
         xx[..., keep, :][..., keep] - x_sum @ x_sum.mT / count,
         (n - 1).clamp(min=0),
     )
-
-
-def log_evidence(prior: MNIW, statistics: RegressionStatistics) -> Float[Tensor, "*batch"]:
-    """log p(Y | X) of the pairs behind ``statistics`` with F and S integrated out, in nats."""
-    after, d = posterior(prior, statistics), prior.M.shape[-2]
-    constant = statistics.n * d / 2 * math.log(2 * math.pi)
-    return log_normaliser(after) - log_normaliser(prior) - constant
-
-
-def predictive_log_likelihood(
-    q: MNIW, x: Float[Tensor, "*#sample p"], y: Float[Tensor, "*#sample d"]
-) -> Float[Tensor, "*sample"]:
-    """log p(y | x) with F and S integrated out, in nats, for each sample by itself.
-
-    A multivariate Student t with nu - d + 1 degrees of freedom, location M x and scale matrix
-    Psi (1 + x^T V x) / (nu - d + 1).
-    """
-    x, y = x.double(), y.double()
-    d = q.Psi.shape[-1]
-    factor = torch.linalg.cholesky(q.Psi)
-    residual = y - torch.einsum("...ij,...j->...i", q.M, x)
-    squared = (
-        torch.einsum("...ij,...j->...i", cholesky.inverse_factor(factor), residual).square().sum(-1)
-    )
-    inflation = 1 + _form(q.V, x, x)
-    log_det = cholesky.log_determinant(factor) + d * inflation.log()
-    return (
-        torch.lgamma((q.nu + 1) / 2)
-        - torch.lgamma((q.nu - d + 1) / 2)
-        - 0.5 * (d * math.log(math.pi) + log_det)
-        - (q.nu + 1) / 2 * torch.log1p(squared / inflation)
-    )
-
-
-def _form(
-    matrix: Float[Tensor, "*#sample i j"],
-    left: Float[Tensor, "*#sample i"],
-    right: Float[Tensor, "*#sample j"],
-) -> Float[Tensor, "*sample"]:
-    """left^T A right; the matrix is not copied along axes on which it broadcasts."""
-    return (left * torch.einsum("...ij,...j->...i", matrix, right)).sum(-1)

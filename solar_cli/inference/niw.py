@@ -42,11 +42,6 @@ def standard(parameters: RegressionStatistics) -> NIW:
     return NIW(q.Psi, q.nu, q.M[..., 0], 1 / q.V[..., 0, 0])
 
 
-def log_normaliser(q: NIW) -> Float[Tensor, "*batch"]:
-    """log Z of the joint density of (mu, Sigma), with all constants."""
-    return mniw.log_normaliser(_as_regression(q))
-
-
 def kl_divergence(q: NIW, p: NIW) -> Float[Tensor, "*batch"]:
     """KL(q || p) in nats."""
     return mniw.kl_divergence(_as_regression(q), _as_regression(p))
@@ -63,25 +58,17 @@ def initial_statistics(
 
 
 def expected_initial_kl(
-    q: NIW, z_mean: Float[Tensor, "*#sample d"], z_variance: Float[Tensor, "*#sample d"]
-) -> Float[Tensor, "*sample"]:
-    """E_q(mu,Sigma) KL(N(z_mean, diag z_variance) || N(mu, Sigma)) in nats, for each sample.
+    parameters: RegressionStatistics,
+    starts: RegressionStatistics,
+    log_variance: Float[Tensor, "*batch"],
+) -> Float[Tensor, "*batch"]:
+    """Sum over starts of E_q(mu,Sigma) KL(N(z_mean, diag z_variance) || N(mu, Sigma)) in nats.
 
-    The t = 0 term of the latent KL, which the paper's ELBO leaves out; differentiable in both.
+    The t = 0 term of the latent KL, which the paper's ELBO leaves out. ``parameters`` are natural
+    ones; ``starts`` and ``log_variance`` are as `mniw.expected_transition_kl` has them.
     """
-    one = torch.ones_like(z_mean[..., :1])
-    expected = mniw.expected_statistics(_as_regression(q))
-    return mniw.expected_transition_kl(expected, z_mean, z_variance, one, torch.zeros_like(one))
-
-
-def posterior(prior: NIW, statistics: RegressionStatistics) -> NIW:
-    """The belief after the initial states behind ``statistics``."""
-    return standard(natural(prior).plus(statistics))
-
-
-def point_estimate(q: NIW) -> tuple[Float[Tensor, "*batch d"], Float[Tensor, "*batch d d"]]:
-    """mu0 and Psi / nu, as for the dynamics (section 4.1)."""
-    return q.mu0, q.Psi / q.nu[..., None, None]
+    expected = mniw.expected_statistics(parameters)
+    return mniw.expected_transition_kl(expected, starts, log_variance)
 
 
 def _as_regression(q: NIW) -> MNIW:

@@ -1,6 +1,6 @@
 """What local methods share around Algorithm 1: the policy, the trust region, the metrics.
 
-A local method gives `make_prior` (or another representation) and `iterate`.
+A local method gives `make_prior` and `iterate`.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from solar_cli.control.latent_policy import LatentPolicy
 from solar_cli.control.linear_gaussian import LinearGaussianPolicy, initial_policy
 from solar_cli.control.linearise import Linearisation, linearise_policy
+from solar_cli.control.local_dynamics import LocalDynamics, infer_dynamics
 from solar_cli.control.lqr import Outcome, PolicyUpdate
 from solar_cli.control.quadratic_cost import FittedCost, explained, fit_quadratic_cost
 from solar_cli.control.step_size import StepSize
@@ -46,13 +47,13 @@ class LocalLearner(ABC):
         self.task = task
         self.streams = streams
         self.device = device
+        self.pulse = pulse
         self.latent = settings.representation.latent
-        self.representation = Representation(
-            settings, task, self.make_prior, self._cost_score, streams, device, pulse
-        )
+        self.representation = self.make_representation()
         self.gains = initial_policy(
             task.horizon, self.representation.state_size, task.action.size, task.exploration.std
         )
+        self.handed = self.gains
         low, high = settings.update.multiplier
         self.trust_region = TrustRegion(StepSize(low=low, high=high))
         self.updates = 0
@@ -61,11 +62,30 @@ class LocalLearner(ABC):
     def make_prior(self) -> Prior:
         """The prior over latents that the representation is trained with."""
 
+    @abstractmethod
+    def iterate(self, experience: Experience) -> dict[str, float]:
+        """As `Learner.iterate`: one turn of Algorithm 1."""
+
+    def make_representation(self) -> Representation:
+        """An untrained representation."""
+        return Representation(
+            self.settings,
+            self.task,
+            self.make_prior,
+            self._cost_score,
+            self.streams,
+            self.device,
+            self.pulse,
+        )
+
     @property
     def policy(self) -> LatentPolicy:
-        """The newest policy, not yet tried: one constrained step from episodes that were."""
+        """The newest policy, or the one that it was made from where it promises little."""
+        return self._acting(self.handed)
+
+    def _acting(self, gains: LinearGaussianPolicy) -> LatentPolicy:
         return LatentPolicy(
-            self.gains,
+            gains,
             self.representation,
             self.task.observation.window,
             self.task.exploration.smoothing,
@@ -78,20 +98,21 @@ class LocalLearner(ABC):
         floor = early if self.updates < update.early_updates else later
         return floor * std, update.std_ceiling * std
 
-    def max_kl(self, region: TrustRegion) -> float | None:
-        """Nats that the trajectory distribution may move; None without a bound."""
+    def max_kl(self, region: TrustRegion, steps: int) -> float | None:
+        """Nats that the distribution over ``steps`` time steps may move; None without a bound."""
         step = self.settings.update.kl_step
         if isinstance(step, str):
             return None
-        return step * self.task.horizon * region.step.multiplier
+        return step * steps * region.step.multiplier
 
     def collect(self, experience: Experience) -> Anchor:
         """Line 4: episodes of the current policy, judged without noise where the card says so."""
         batches = self.settings.batches
         count = batches.initial if experience.iteration == 1 else batches.noisy
-        judged = experience.collect(self.policy, count)
+        newest = self._acting(self.gains)
+        judged = experience.collect(newest, count)
         if batches.noise_free:
-            judged = experience.collect(self.policy, batches.noise_free, noisy=False)
+            judged = experience.collect(newest, batches.noise_free, noisy=False)
         if not np.isfinite(judged.costs).all():
             raise Diverged(f"a cost of iteration {experience.iteration} is not finite")
         return Anchor.of(experience.iteration, self.gains, judged)
@@ -105,9 +126,18 @@ class LocalLearner(ABC):
         others = others[: self.settings.local_fit.older_batches]
         return experience.collected(chosen), [experience.collected(i) for i in others]
 
-    def embedded(self, episodes: Episodes) -> Trajectories:
-        """Latent states of episodes, on the CPU: control runs there."""
-        return Trajectories.of(self.representation.embed(episodes).cpu(), episodes)
+    def embedded(
+        self, episodes: Episodes, older: list[Episodes]
+    ) -> tuple[Trajectories, list[Trajectories]]:
+        """Latent states of episodes, on the CPU: control runs there.
+
+        Where episodes ended early, only of the time steps that there is something to plan by.
+        """
+        newest, *others = (
+            Trajectories.of(self.representation.embed(batch).cpu(), batch)
+            for batch in (episodes, *older)
+        )
+        return newest.until(newest.planned), [batch.until(newest.planned) for batch in others]
 
     def latent_prior(self, older: list[Episodes]) -> LatentPrior:
         """What the model knows of its dynamics: a source of the prior of line 7."""
@@ -115,11 +145,26 @@ class LocalLearner(ABC):
         return self.representation.dynamics_prior(older, as_it_stands=own)
 
     def linearised(self, region: TrustRegion, states: Trajectories) -> Linearisation:
-        """Line 6: the policy to improve, in the latents of now."""
-        gains = region.built_upon.gains
-        if self.representation.moved and self.settings.update.linearise:
-            return linearise_policy(states.z[:, :-1], states.action_means, gains)
+        """Line 6: the policy to improve, in the latents of now.
+
+        It acted on the latents from before its iteration's update: that one or a later one may have
+        changed them.
+        """
+        iteration = region.built_upon.iteration
+        gains = region.built_upon.gains.until(states.live.shape[1])
+        if self.representation.moved_in >= iteration and self.settings.update.linearise:
+            return linearise_policy(states.z[:, :-1], states.action_means, states.live, gains)
         return Linearisation(gains, residual=0.0, ridge=0.0)
+
+    def infer_dynamics(
+        self,
+        states: Trajectories,
+        older: list[Trajectories],
+        prior: LatentPrior,
+        streams: Streams,
+    ) -> LocalDynamics:
+        """Line 7: local dynamics around the newest latents."""
+        return infer_dynamics(states, older, prior, self.settings.local_fit, streams)
 
     def fitted_cost(self, states: Trajectories) -> FittedCost:
         """The quadratic cost of the newest latents (section 3)."""
@@ -127,11 +172,24 @@ class LocalLearner(ABC):
             states, self.task.action_cost, self.settings.cost_fit, self.latent
         )
 
-    def adopt(self, region: TrustRegion, promised: float, update: PolicyUpdate) -> dict[str, float]:
-        """Make the update the policy to try next; metrics of the step."""
+    def adopt(
+        self,
+        region: TrustRegion,
+        previous: LinearGaussianPolicy,
+        promised: float,
+        update: PolicyUpdate,
+        reached: int,
+    ) -> dict[str, float]:
+        """Make the update the policy to try next; metrics of the step.
+
+        What few episodes ``reached`` is planned for, so that there is a future to act for; the
+        gains that act for it are those before, which go on.
+        """
         if not all(bool(torch.isfinite(part).all()) for part in update.policy):
             raise Diverged("the updated policy is not finite")
-        self.gains = update.policy
+        self.gains = update.policy.held(reached, self.task.horizon)
+        trusted = self.settings.update.reject == "never" or region.trusts(promised)
+        self.handed = self.gains if trusted else previous.held(reached, self.task.horizon)
         self.trust_region = replace(region, promised=promised)
         self.updates += 1
         stuck = update.outcome in (Outcome.NOT_POSITIVE_DEFINITE, Outcome.BRACKET_EXHAUSTED)
@@ -141,6 +199,7 @@ class LocalLearner(ABC):
             "policy_std": float(torch.linalg.eigvalsh(update.policy.S).clamp_min(0).sqrt().mean()),
             "dual": update.eta,
             "update_failed": float(stuck),
+            "handed_over_untried": float(trusted),
         }
 
     def diagnose(self, evaluation: Evaluation) -> dict[str, float]:
@@ -148,9 +207,9 @@ class LocalLearner(ABC):
         if not self.representation.trained or not evaluation.truth_names:
             return {}
         states = self.representation.embed(evaluation.episodes)[..., : self.latent]
-        latents = states.flatten(0, 1).cpu().numpy()
-        truth = evaluation.truth.reshape(len(latents), -1)
-        return latent_metrics(latents, truth, evaluation.truth_names)
+        live = evaluation.episodes.live_frames
+        latents = states.cpu().numpy()[live]
+        return latent_metrics(latents, evaluation.truth[live], evaluation.truth_names)
 
     def reconstruct(self, episodes: Episodes) -> NDArray[Any] | None:
         """Frames as the observation model expects them from the encoder's mean."""
@@ -161,6 +220,7 @@ class LocalLearner(ABC):
         return {
             "representation": self.representation.state_dict(),
             "gains": [gain.clone() for gain in self.gains],
+            "handed": [gain.clone() for gain in self.handed],
             "trust_region": self.trust_region.state_dict(),
             "updates": self.updates,
         }
@@ -169,6 +229,7 @@ class LocalLearner(ABC):
         """Take up a saved state."""
         self.representation.load_state_dict(state["representation"])
         self.gains = LinearGaussianPolicy(*state["gains"])
+        self.handed = LinearGaussianPolicy(*state["handed"])
         self.trust_region = self.trust_region.restored(state["trust_region"])
         self.updates = state["updates"]
 

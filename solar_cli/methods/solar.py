@@ -7,12 +7,11 @@ another model into the same page.
 
 from __future__ import annotations
 
-from solar_cli.control.local_dynamics import infer_dynamics
 from solar_cli.control.lqr import improve_policy
 from solar_cli.control.trust_region import promised_fall
 from solar_cli.episodes import Experience
 from solar_cli.methods.local import LocalLearner
-from solar_cli.models.priors import LinearDynamics, Prior
+from solar_cli.models.priors import BayesianLDS, Prior
 from solar_cli.settings.local import Solar as SolarSettings
 
 
@@ -22,7 +21,7 @@ class Solar(LocalLearner):
     def make_prior(self) -> Prior:
         """The prior over latents that the representation is trained with (Eq. 2 and 3)."""
         assert isinstance(self.settings, SolarSettings)
-        return LinearDynamics(self.settings.dynamics, self.latent, self.task, self.device)
+        return BayesianLDS(self.settings.dynamics, self.latent, self.task, self.device)
 
     def iterate(self, experience: Experience) -> dict[str, float]:
         """One turn of Algorithm 1 (lines 4 to 8)."""
@@ -31,19 +30,19 @@ class Solar(LocalLearner):
         episodes, older = self.batches(experience, region)
 
         model = self.representation.update(experience)  # line 5: MODELUPDATE, section 3
-        states, older_states = self.embedded(episodes), [self.embedded(batch) for batch in older]
+        states, older_states = self.embedded(episodes, older)
 
         previous = self.linearised(region, states)  # line 6: LINEARIZEPOLICY, appendix C
-        dynamics = infer_dynamics(  # line 7: INFERDYNAMICS, section 4.1 and appendix B
+        dynamics = self.infer_dynamics(  # line 7: INFERDYNAMICS, section 4.1 and appendix B
             states,
             older_states,
             self.latent_prior(older),
-            self.settings.local_fit,
             self.streams.under("local dynamics", experience.iteration),
         )
         cost = self.fitted_cost(states)  # the quadratic cost of section 3
+        bound = self.max_kl(region, len(dynamics.model.F))
         update = improve_policy(  # line 8: POLICYUPDATE, section 4.2 and appendix A
-            previous.policy, dynamics.model, cost.model, self.max_kl(region), self.std_bounds()
+            previous.policy, dynamics.model, cost.model, bound, self.std_bounds()
         )
         promised = promised_fall(previous.policy, update.policy, dynamics.model, cost.model)
         return {
@@ -52,5 +51,5 @@ class Solar(LocalLearner):
             "cost_r2": cost.r2,
             "cost_per_time": float(cost.per_time),
             "linearisation_residual": previous.residual,
-            **self.adopt(region, promised, update),
+            **self.adopt(region, previous.policy, promised, update, states.reached),
         }

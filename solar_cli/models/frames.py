@@ -15,6 +15,7 @@ from solar_cli.settings.local import Representation
 from solar_cli.settings.task import Observation
 
 INITIAL_LOG_VARIANCE = -4.0
+CHUNK = 512  # frames in floating point at once: bounds memory, loses no speed
 LOG_VARIANCE_RANGE = (-14.0, 4.0)  # beyond it a float32 KL term overflows its gradient
 
 
@@ -80,13 +81,15 @@ class FrameModel(nn.Module):
     def standardise_by(self, frames: Tensor) -> None:
         """Take mean image and pixel scale from collected frames (n, *frame)."""
         if self.settings.input == "standardised":
-            values = frames.float()
-            self.frame_mean.copy_(values.mean(dim=0))
-            spread = (values - self.frame_mean).square()
+            count, chunks = len(frames), torch.split(frames, CHUNK)
+            mean = torch.stack([chunk.double().sum(dim=0) for chunk in chunks]).sum(dim=0) / count
+            squares = [(chunk - mean).square().sum(dim=0) for chunk in chunks]
+            variance = torch.stack(squares).sum(dim=0) / count
+            self.frame_mean.copy_(mean)
             if self.observation.kind == "image":
-                self.frame_scale.copy_(spread.mean().sqrt().clamp_min(1e-6))
+                self.frame_scale.copy_(variance.mean().sqrt().clamp_min(1e-6))
             else:  # entries of a state have units of their own; a constant one stays zero
-                scale = spread.mean(dim=0).sqrt()
+                scale = variance.sqrt()
                 self.frame_scale.copy_(torch.where(scale > 1e-6, scale, 1.0))
         elif self.observation.kind == "image":
             self.frame_scale.fill_(255.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -10,10 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from solar_cli.episodes import Episodes
-from solar_cli.models.frames import FrameModel
+from solar_cli.models.frames import CHUNK, FrameModel
 from solar_cli.models.priors import Prior, Segments, standard_normal_kl
-
-CHUNK = 512  # frames encoded at once: bounds memory, loses no speed
 
 
 class Minibatch(NamedTuple):
@@ -28,6 +26,8 @@ class Minibatch(NamedTuple):
     """standard normal draws for the sample of q(z | s)"""
     decoded: Tensor
     """numbers of the frames, of S L, that are decoded"""
+    starts: Tensor | None = None
+    """(S,) segments of this length that each one's episode has; None for a whole episode's"""
 
 
 class LatentModel:
@@ -38,27 +38,33 @@ class LatentModel:
         self.prior = prior
         self.standard_normal = standard_normal
 
-    def loss(
-        self, batch: Minibatch, kl_weight: float
-    ) -> tuple[Tensor, Segments, dict[str, Tensor]]:
-        """The negative ELBO in nats a frame, the factors q(z | s), and the ELBO's terms."""
+    def loss(self, batch: Minibatch, kl_weight: float) -> tuple[Tensor, Any, dict[str, Tensor]]:
+        """The negative ELBO in nats a frame, what the prior learns from, and the ELBO's terms.
+
+        The prior's KL terms weigh every time step of an episode alike; the reconstruction is a mean
+        over the frames that were drawn, of which the first and last of an episode are fewer.
+        """
         scaled = self.networks.scaled(batch.frames.flatten(0, 1))
         mean, variance = self.networks.encode(scaled)
         sample = mean + variance.sqrt() * batch.noise.flatten(0, 1)
         reconstruction = self.networks.reconstruction_loss(
-            sample[batch.decoded], scaled[batch.decoded]
+            sample.index_select(0, batch.decoded), scaled.index_select(0, batch.decoded)
         )
         shape = (*batch.frames.shape[:2], -1)
         segments = Segments(
-            mean.view(shape).double(), variance.view(shape).double(), batch.actions, batch.start
+            mean.view(shape).double(),
+            variance.view(shape).double(),
+            batch.actions,
+            batch.start,
+            starts=batch.starts,
         )
-        kl = self.prior.kl(segments)
-        total_kl = kl
+        statistics = self.prior.statistics(segments)
+        kl = self.prior.kl(statistics)
+        loss = reconstruction + kl_weight * kl
         if self.standard_normal:
             spread = standard_normal_kl(segments.mean, segments.variance).mean()
-            total_kl = kl + self.standard_normal * spread
-        loss = reconstruction + kl_weight * total_kl
-        return loss, segments, {"elbo_reconstruction": -reconstruction, "elbo_kl": kl}
+            loss = loss + kl_weight * self.standard_normal * spread
+        return loss, statistics, {"elbo_reconstruction": -reconstruction, "elbo_kl": kl}
 
     @torch.no_grad()
     def embed(self, frames: Tensor) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d"]]:
@@ -75,9 +81,11 @@ class LatentModel:
         frames = torch.from_numpy(np.ascontiguousarray(episodes.frames)).to(device)
         mean, variance = self.embed(frames.flatten(0, 1))
         shape = (*frames.shape[:2], -1)
+        live = episodes.live_frames
         return Segments(
             mean.view(shape),
             variance.view(shape),
             torch.from_numpy(episodes.actions).to(device),
             torch.zeros(len(episodes), dtype=torch.long, device=device),
+            None if live.all() else torch.from_numpy(live).to(device),
         )

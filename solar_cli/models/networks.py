@@ -33,21 +33,19 @@ class SpatialSoftmaxLayer(nn.Module):
     Finn et al. 2016, deep spatial auto-encoders, with a learned sharpness.
     """
 
-    columns: Tensor
-    rows: Tensor
+    places: Tensor
 
     def __init__(self, height: int, width: int, log_sharpness: float) -> None:
         super().__init__()
         self.log_sharpness = nn.Parameter(torch.tensor(log_sharpness))
-        self.register_buffer("columns", torch.linspace(-1, 1, width), persistent=False)
-        self.register_buffer("rows", torch.linspace(1, -1, height), persistent=False)
+        rows, columns = torch.linspace(1, -1, height), torch.linspace(-1, 1, width)
+        places = torch.cartesian_prod(rows, columns).flip(-1)
+        self.register_buffer("places", places, persistent=False)
 
     def forward(self, maps: Float[Tensor, "n c h w"]) -> Float[Tensor, "n two_c"]:
         """Coordinates of all channels: x of each, then y of each (up is positive)."""
-        share = (maps.flatten(2) * self.log_sharpness.exp()).softmax(dim=-1).view_as(maps)
-        x = (share.sum(dim=2) * self.columns).sum(dim=-1)
-        y = (share.sum(dim=3) * self.rows).sum(dim=-1)
-        return torch.cat([x, y], dim=-1)
+        share = (maps.flatten(2) * self.log_sharpness.exp()).softmax(dim=-1)
+        return (share @ self.places).mT.flatten(1)
 
 
 class BumpsLayer(nn.Module):

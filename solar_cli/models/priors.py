@@ -1,7 +1,7 @@
 """Priors over latent trajectories: SOLAR's Bayesian linear dynamical system, the VAE's N(0, I).
 
 Axes: S segments, L frames of a segment, W frames of a window, d latents of a frame, a actions,
-p = W d + a + 1 regressors (the constant 1 gives the dynamics an affine term).
+p = W d + a + 1 regressors (the constant 1 gives the dynamics an affine term), T actions an episode.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple, Protocol
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from solar_cli.inference import mniw, niw
@@ -19,13 +19,27 @@ from solar_cli.settings.local import Dynamics
 
 
 class Segments(NamedTuple):
-    """Posterior factors q(z | s) of segments of consecutive frames, float64."""
+    """Posterior factors q(z | s) of segments of consecutive frames, float64.
+
+    All segments have L frames of an episode's T + 1. Where they are shorter than an episode, their
+    starts are taken as drawn uniformly: what such segments reach less often counts for more.
+    """
 
     mean: Float[Tensor, "S L d"]
     variance: Float[Tensor, "S L d"]
     actions: Float[Tensor, "S L_1 a"]
     start: Int[Tensor, " S"]
     """time step of the first frame; 0 where an episode begins"""
+    live: Bool[Tensor, "S L"] | None = None
+    """the frames that count, the first ones of each segment; None where all do"""
+    starts: Int[Tensor, " S"] | None = None
+    """starts that a segment of each one's episode can have; None for a whole episode's T + 2 - L"""
+
+    def counted(self, part: Float[Tensor, "S n *rest"]) -> Float[Tensor, "k *rest"]:
+        """Of one value a frame, or a transition to one of the last n frames: those that count."""
+        if self.live is None:
+            return part.flatten(0, 1)
+        return part[self.live[:, self.live.shape[1] - part.shape[1] :]]
 
 
 class LatentPrior(NamedTuple):
@@ -45,18 +59,20 @@ class Prior(Protocol):
     def factor(self) -> mniw.RegressionStatistics | None:
         """q(F, Sigma) over [windows of latents; a; 1], or None for a prior without dynamics."""
 
-    def kl(self, segments: Segments) -> Tensor:
+    def statistics(self, segments: Segments) -> Any:
+        """What ``kl`` and ``learn`` need to know of segments; differentiable."""
+
+    def kl(self, statistics: Any) -> Tensor:
         """KL(q(z) || prior), nats a frame."""
 
-    def learn(self, segments: Segments, weights: tuple[float, float]) -> None:
-        """One natural-gradient step (Eq. 6); ``weights`` scale the segments to the whole data:
-        one for transitions, one for starts of episodes."""
+    def learn(self, statistics: Any, scale: float) -> None:
+        """One natural-gradient step (Eq. 6); ``scale`` is B, episodes a segment stands for."""
 
-    def conclude(self, segments: Segments) -> None:
-        """End a training: the closed form given ``segments`` as the whole data."""
+    def conclude(self, episodes: Segments) -> None:
+        """End a training: the closed form given whole ``episodes``, all there are."""
 
-    def given(self, segments: Segments) -> mniw.RegressionStatistics | None:
-        """The factor given ``segments`` alone; None for a prior without dynamics."""
+    def given(self, episodes: Segments) -> mniw.RegressionStatistics | None:
+        """The factor given whole ``episodes`` alone; None for a prior without dynamics."""
 
     def metrics(self) -> dict[str, float]:
         """KL of the factors over parameters, in nats."""
@@ -73,17 +89,22 @@ class StandardNormal:
 
     factor = None
 
-    def kl(self, segments: Segments) -> Tensor:
+    def statistics(self, segments: Segments) -> Segments:
+        """The segments as they are."""
+        return segments
+
+    def kl(self, statistics: Segments) -> Tensor:
         """KL(N(mean, variance) || N(0, I)), nats a frame."""
-        return standard_normal_kl(segments.mean, segments.variance).mean()
+        kl = standard_normal_kl(statistics.mean, statistics.variance)
+        return statistics.counted(kl).mean()
 
-    def learn(self, segments: Segments, weights: tuple[float, float]) -> None:
+    def learn(self, statistics: Segments, scale: float) -> None:
         """Nothing to learn."""
 
-    def conclude(self, segments: Segments) -> None:
+    def conclude(self, episodes: Segments) -> None:
         """Nothing to learn."""
 
-    def given(self, segments: Segments) -> None:
+    def given(self, episodes: Segments) -> None:
         """No dynamics."""
 
     def metrics(self) -> dict[str, float]:
@@ -108,10 +129,27 @@ def regressors(mean: Float[Tensor, "S L d"], window: int) -> Float[Tensor, "S n 
     return mean.unfold(1, window, 1).flip(-1).transpose(-1, -2).flatten(2)
 
 
-class LinearDynamics:
+class DynamicsStatistics(NamedTuple):
+    """Expected statistics of segments, each transition and start weighed (see `Segments`).
+
+    With a factor a time step, those of transitions have a leading axis T.
+    """
+
+    transitions: mniw.RegressionStatistics
+    transitions_log_variance: Float[Tensor, "*T"]
+    """sum of the logarithms of the variances of z_{t+1}"""
+    starts: mniw.RegressionStatistics
+    starts_log_variance: Float[Tensor, ""]
+    judged: int
+    """frames that these terms judge: S times those of an episode"""
+
+
+class BayesianLDS:
     """MNIW factors over (F, Sigma) and the NIW factor over (mu, Sigma_0), Eq. 2 to 5.
 
-    With ``factors = "shared"`` one factor explains every time step, else each has its own.
+    With ``factors = "shared"`` one factor explains every time step, else each has its own. Only
+    whole windows are judged: frames 1 to W - 1 of an episode stand in no term, and factors of time
+    steps before W - 1 stay the prior.
     """
 
     def __init__(
@@ -123,6 +161,7 @@ class LinearDynamics:
     ) -> None:
         self.settings = settings
         self.window = window = task.observation.window
+        self.horizon = task.horizon
         d = latent if settings.rows == "newest" else latent * window
         p = latent * window + task.action.size + 1
         zero = torch.zeros((), dtype=torch.float64, device=device)
@@ -150,92 +189,108 @@ class LinearDynamics:
         )
         self.initial = self.initial_prior
 
-    def _times(self, segments: Segments) -> Int[Tensor, "S n"]:
-        """Time step t of each transition z_t -> z_{t+1}."""
-        count = segments.mean.shape[1] - self.window
-        return segments.start[:, None] + torch.arange(
-            self.window - 1, self.window - 1 + count, device=segments.start.device
-        )
+    def statistics(self, segments: Segments) -> DynamicsStatistics:
+        """Expected sufficient statistics, such that their mean over starts is an episode's."""
+        count = len(segments.start)
+        times, weights, start_weights = self._weights(segments)
+        x, x_variance, y, y_variance = self._transitions(segments)
+        logs = y_variance.log().sum(dim=-1)
+        if self.settings.factors == "shared":
+            flat = [part.flatten(0, 1) for part in (x, y, x_variance, y_variance, weights)]
+            transitions = mniw.regression_statistics(*flat)
+            log_variance = (weights * logs).sum()
+        else:
+            # One "sample axis" of length 1 a transition, then summed by time step.
+            single = mniw.regression_statistics(
+                *(part.flatten(0, 1)[:, None] for part in (x, y, x_variance, y_variance, weights))
+            )
+            at = times.flatten()
+            transitions = mniw.RegressionStatistics(
+                *(
+                    torch.zeros_like(p).index_add(0, at, s)
+                    for p, s in zip(self.prior, single, strict=True)
+                )
+            )
+            log_variance = torch.zeros_like(self.prior.n).index_add(
+                0, at, (weights * logs).flatten()
+            )
+        first, variance = segments.mean[:, 0], segments.variance[:, 0]
+        starts = niw.initial_statistics(first, variance, start_weights)
+        starts_log_variance = (start_weights * variance.log().sum(dim=-1)).sum()
+        judged = count * (self.horizon + 2 - self.window)
+        if segments.live is not None:
+            judged = int(segments.live[:, self.window :].sum()) + count
+        return DynamicsStatistics(transitions, log_variance, starts, starts_log_variance, judged)
+
+    def _weights(
+        self, segments: Segments
+    ) -> tuple[Int[Tensor, "S n"], Float[Tensor, "S n"], Float[Tensor, " S"]]:
+        """Time step t of each transition z_t -> z_{t+1}, its weight, and the weight of each start.
+
+        The weight is the number of starts a segment can have over that of those which reach t: the
+        inverse of the chance that a segment shows it. Every start of every episode has the same
+        chance; where episodes end early, theirs are counted.
+        """
+        start, length = segments.start, segments.mean.shape[1]
+        starts = self.horizon + 2 - length
+        own = torch.full_like(start, starts) if segments.starts is None else segments.starts
+        times = start[:, None] + torch.arange(self.window - 1, length - 1, device=start.device)
+        first = (times - length + 2).clamp_min(0)
+        last = torch.minimum(times - self.window + 1, own[:, None] - 1)
+        weights = starts / (last - first + 1).clamp_min(1).double()
+        if segments.live is not None:
+            weights = weights * segments.live[:, self.window :]
+        return times, weights, starts * (start == 0).double()
 
     def _transitions(self, segments: Segments) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """(x mean, x variance, y mean, y variance) of all transitions, (S, n, ...)."""
         mean = regressors(segments.mean, self.window)
         variance = regressors(segments.variance, self.window)
-        count = mean.shape[1] - 1
-        actions = segments.actions[:, self.window - 1 : self.window - 1 + count]
-        one = torch.ones_like(actions[..., :1])
-        x = torch.cat([mean[:, :-1], actions, one], dim=-1)
-        x_variance = torch.cat(
-            [variance[:, :-1], torch.zeros_like(actions), torch.zeros_like(one)], dim=-1
-        )
+        actions = segments.actions[:, self.window - 1 :]
+        known = torch.cat([actions, torch.ones_like(actions[..., :1])], dim=-1)
+        x = torch.cat([mean[:, :-1], known], dim=-1)
+        x_variance = torch.cat([variance[:, :-1], torch.zeros_like(known)], dim=-1)
         if self.settings.rows == "all":
             return x, x_variance, mean[:, 1:], variance[:, 1:]
         newest = slice(self.window, None)
         return x, x_variance, segments.mean[:, newest], segments.variance[:, newest]
 
-    def kl(self, segments: Segments) -> Tensor:
-        """Transition terms and the t = 0 term of the ELBO, averaged over the frames they judge."""
-        x, x_variance, y, y_variance = self._transitions(segments)
-        expected = mniw.expected_statistics(mniw.standard(self.factor))
-        if self.settings.factors == "varying":
-            times = self._times(segments)
-            expected = mniw.ExpectedStatistics(*(part[times] for part in expected))
-        transition = mniw.expected_transition_kl(expected, y, y_variance, x, x_variance)
-        first = segments.start == 0
-        initial = niw.expected_initial_kl(
-            niw.standard(self.initial), segments.mean[first, 0], segments.variance[first, 0]
+    def kl(self, statistics: DynamicsStatistics) -> Tensor:
+        """Transition terms and the t = 0 term of the ELBO, a frame that they judge."""
+        expected = mniw.expected_statistics(self.factor)
+        transitions = mniw.expected_transition_kl(
+            expected, statistics.transitions, statistics.transitions_log_variance
         )
-        return (transition.sum() + initial.sum()) / (transition.numel() + initial.numel())
-
-    def _statistics(
-        self, segments: Segments
-    ) -> tuple[mniw.RegressionStatistics, mniw.RegressionStatistics]:
-        x, x_variance, y, y_variance = self._transitions(segments)
-        if self.settings.factors == "shared":
-            flat = [part.flatten(0, 1) for part in (x, y, x_variance, y_variance)]
-            transitions = mniw.regression_statistics(*flat)
-        else:
-            # One "sample axis" of length 1 a transition, then summed by time step.
-            single = mniw.regression_statistics(
-                *(part.flatten(0, 1)[:, None] for part in (x, y, x_variance, y_variance))
-            )
-            times = self._times(segments).flatten()
-            transitions = mniw.RegressionStatistics(
-                *(
-                    torch.zeros_like(p).index_add(0, times, s)
-                    for p, s in zip(self.prior, single, strict=True)
-                )
-            )
-        first = segments.start == 0
-        initial = niw.initial_statistics(segments.mean[first, 0], segments.variance[first, 0])
-        return transitions, initial
+        starts = niw.expected_initial_kl(
+            self.initial, statistics.starts, statistics.starts_log_variance
+        )
+        return (transitions.sum() + starts) / statistics.judged
 
     @torch.no_grad()
-    def learn(self, segments: Segments, weights: tuple[float, float]) -> None:
+    def learn(self, statistics: DynamicsStatistics, scale: float) -> None:
         """One natural-gradient step on both factors (Eq. 6)."""
-        transitions, initial = self._statistics(segments)
         rate = self.settings.rate
         self.factor = mniw.natural_gradient_step(
-            self.factor, self.prior, transitions, weights[0], rate
+            self.factor, self.prior, statistics.transitions, scale, rate
         )
         self.initial = niw.natural_gradient_step(
-            self.initial, self.initial_prior, initial, weights[1], rate
+            self.initial, self.initial_prior, statistics.starts, scale, rate
         )
 
     @torch.no_grad()
-    def conclude(self, segments: Segments) -> None:
+    def conclude(self, episodes: Segments) -> None:
         """The exact conjugate update, a step of rate 1; or another step, where settings say so."""
+        statistics = self.statistics(episodes)
         if not self.settings.closed_form:
-            self.learn(segments, (1.0, 1.0))
+            self.learn(statistics, 1.0)
             return
-        transitions, initial = self._statistics(segments)
-        self.factor = self.prior.plus(transitions)
-        self.initial = self.initial_prior.plus(initial)
+        self.factor = self.prior.plus(statistics.transitions)
+        self.initial = self.initial_prior.plus(statistics.starts)
 
     @torch.no_grad()
-    def given(self, segments: Segments) -> mniw.RegressionStatistics:
-        """The exact posterior over (F, Sigma) given ``segments`` alone."""
-        return self.prior.plus(self._statistics(segments)[0])
+    def given(self, episodes: Segments) -> mniw.RegressionStatistics:
+        """The exact posterior over (F, Sigma) given ``episodes`` alone."""
+        return self.prior.plus(self.statistics(episodes).transitions)
 
     def metrics(self) -> dict[str, float]:
         """KL(q || p) of the factors over parameters: the last terms of the ELBO, in nats."""

@@ -31,8 +31,9 @@ from solar_cli.settings.local import LocalMethod
 from solar_cli.streams import Streams
 
 ACTIVE_SHARE = 0.9  # of a latent's variance that its mean must carry for it to count as active
-LEAST_EXPLAINED = 0.5  # of the variance of each channel
+LEAST_EXPLAINED = 0.4  # of the variance of each channel; a dead one has next to nothing
 LEAST_COST_R2 = 0.5
+JUDGED_FRAMES = 600  # decoded at most to judge a batch: bounds memory
 
 CostScore = Callable[["Representation", Episodes, Episodes], float]
 """R2 on the latter episodes of the cost that control would fit on the former."""
@@ -62,8 +63,8 @@ class Representation:
         self.settings = settings
         self.task = task
         self.device = device
-        self.moved = False
-        """whether the last update changed what states mean"""
+        self.moved_in = 0
+        """the last iteration whose update changed what states mean; 0 before the first"""
         self._make_prior = make_prior
         self._cost_score = cost_score
         self._streams = streams
@@ -119,17 +120,16 @@ class Representation:
     def update(self, experience: Experience) -> dict[str, float]:
         """MODELUPDATE (Algorithm 1, line 5): train on the batches of the last B iterations."""
         recent = experience.recent(self.settings.training.buffer)
-        self.moved = False
         if not self._trained:
-            metrics = self._train_first(recent[-1])
+            metrics = self._train_first(experience.iteration, recent[-1])
         elif self.settings.training.fine_tune_steps:
             metrics = self._fine_tune(experience.iteration, recent)
         else:
             metrics = self._judge(recent[-1])
-            self._model.prior.conclude(self._posterior(Episodes.joined(recent)))
+            self._conclude(recent)
         return {**metrics, **self._model.prior.metrics()}
 
-    def _train_first(self, episodes: Episodes) -> dict[str, float]:
+    def _train_first(self, iteration: int, episodes: Episodes) -> dict[str, float]:
         """Train until a representation is alive, or take the best of the attempts."""
         training = self.settings.training
         kept = max(1, round(training.held_out * len(episodes)))
@@ -138,7 +138,7 @@ class Representation:
             attempt = len(self._candidates)
             if not self._trainer.under_way:
                 self._model = self._untrained(attempt)
-                self._model.networks.standardise_by(self._frames(learned))
+                self._model.networks.standardise_by(self._live_frames(learned))
             name = f"attempt {attempt}"
             terms = self._trainer.fit(name, self._model, [learned], training.steps)
             self._basis = self._whitening(learned)
@@ -160,7 +160,7 @@ class Representation:
             "seconds_discarded": seconds - best.metrics["seconds_training"],
         }
         self._take_up(best.parameters)
-        self._trained = self.moved = True
+        self._trained, self.moved_in = True, iteration
         self._candidates = []
         return {**best.metrics, **discarded}
 
@@ -176,10 +176,16 @@ class Representation:
         name = f"iteration {iteration}"
         terms = self._trainer.fit(name, self._model, recent, steps, fine_tuning=True)
         self._before = None
-        self.moved = not self._alive(before.metrics) or self._alive(self._judge(newest))
-        if not self.moved:
+        kills = self._alive(before.metrics) and not self._alive(self._judge(newest))
+        if kills:
             self._take_up(before.parameters)
-        return {**terms, **before.metrics, "fine_tuning_taken_back": float(not self.moved)}
+            self._conclude(recent)
+        else:
+            self.moved_in = iteration
+        return {**terms, **before.metrics, "fine_tuning_taken_back": float(kills)}
+
+    def _conclude(self, batches: list[Episodes]) -> None:
+        self._model.prior.conclude(self._posterior(Episodes.joined(batches)))
 
     @staticmethod
     def _alive(metrics: dict[str, float]) -> bool:
@@ -192,12 +198,13 @@ class Representation:
         """What there is to watch, on collected episodes that the model has not been trained on."""
         model = self._model
         segments = self._posterior(episodes)
-        mean, variance = segments.mean.flatten(0, 1), segments.variance.flatten(0, 1)
-        scaled = model.networks.scaled(self._frames(episodes))
-        draws = self._streams.generator("judging").standard_normal(mean.shape)
-        sample = mean + variance.sqrt() * torch.from_numpy(draws).to(mean)
+        mean, variance = segments.counted(segments.mean), segments.counted(segments.variance)
+        some = slice(None, None, -(-len(mean) // JUDGED_FRAMES))
+        scaled = model.networks.scaled(self._live_frames(episodes)[some])
+        draws = self._streams.generator("judging").standard_normal(mean[some].shape)
+        sample = mean[some] + variance[some].sqrt() * torch.from_numpy(draws).to(mean)
         reconstruction = model.networks.reconstruction_loss(sample.float(), scaled)
-        kl = model.prior.kl(segments)
+        kl = model.prior.kl(model.prior.statistics(segments))
         explained = explained_variance(model.networks.reconstruct(scaled), scaled)
         spread = mean.var(dim=0)
         carried = spread / (spread + variance.mean(dim=0))
@@ -223,7 +230,8 @@ class Representation:
     def reconstruct(self, episodes: Episodes) -> np.ndarray[Any, Any]:
         """Expected frames, in the shape and units of ``episodes.frames``."""
         networks = self._model.networks
-        scaled = networks.scaled(self._frames(episodes))
+        seen = torch.from_numpy(np.ascontiguousarray(episodes.frames))
+        scaled = networks.scaled(seen.flatten(0, 1).to(self.device))
         frames = networks.as_frames(networks.reconstruct(scaled))
         return frames.cpu().numpy().reshape(episodes.frames.shape)
 
@@ -234,6 +242,7 @@ class Representation:
             "trainer": self._trainer.state_dict(),
             "candidates": [tuple(candidate) for candidate in self._candidates],
             "trained": self._trained,
+            "moved_in": self.moved_in,
             "before": None if self._before is None else tuple(self._before),
         }
 
@@ -242,7 +251,7 @@ class Representation:
         self._take_up(state["parameters"])
         self._trainer.load_state_dict(state["trainer"])
         self._candidates = [Candidate(*candidate) for candidate in state["candidates"]]
-        self._trained = state["trained"]
+        self._trained, self.moved_in = state["trained"], state["moved_in"]
         self._before = None if state["before"] is None else Candidate(*state["before"])
 
     def _untrained(self, attempt: int) -> LatentModel:
@@ -257,9 +266,8 @@ class Representation:
     def _posterior(self, episodes: Episodes) -> Segments:
         return self._model.posterior(episodes, self.device)
 
-    def _frames(self, episodes: Episodes) -> Tensor:
-        frames = torch.from_numpy(np.ascontiguousarray(episodes.frames))
-        return frames.flatten(0, 1).to(self.device)
+    def _live_frames(self, episodes: Episodes) -> Float[Tensor, "n *frame"]:
+        return torch.from_numpy(episodes.frames[episodes.live_frames]).to(self.device)
 
     def _windows(self, latents: Float[Tensor, "N T1 d"]) -> Float[Tensor, "N T1 W d"]:
         """The newest frame first."""
@@ -267,8 +275,8 @@ class Representation:
         return latents[:, torch.from_numpy(index[:, ::-1].copy()).to(latents.device)]
 
     def _whitening(self, episodes: Episodes) -> LatentBasis:
-        mean = self._posterior(episodes).mean
-        return LatentBasis.whitening(self._windows(mean).flatten(0, 1))
+        segments = self._posterior(episodes)
+        return LatentBasis.whitening(segments.counted(self._windows(segments.mean)))
 
     def _parameters(self) -> dict[str, Any]:
         networks = {

@@ -12,9 +12,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from solar_cli.episodes import Episodes
+from solar_cli.errors import SolarError
 from solar_cli.models.latent_model import LatentModel, Minibatch
 from solar_cli.models.priors import Segments
 from solar_cli.pulse import Diverged, Pulse
@@ -71,7 +73,7 @@ class Trainer:
             running["step"] += 1
             place = f"step {running['step']} of {name}"
             try:
-                loss, terms = self._step(model, optimiser, batch, weight, data.weights(batch))
+                loss, terms = self._step(model, optimiser, batch, weight, data.scale(batch))
             except torch.linalg.LinAlgError as error:  # type: ignore[attr-defined]
                 raise Diverged(f"{place}: {error}") from error
             self._smooth(running["terms"], terms)
@@ -81,12 +83,12 @@ class Trainer:
                 raise Diverged(f"{place}: the loss is not finite")
             if pausing:
                 running["seconds"] += time.perf_counter() - last
-                last = time.perf_counter()
                 self.pulse(f"training the model ({name})", running["step"] / steps)
+                last = time.perf_counter()  # a pulse may take its time to save
         self._running = self._optimiser = None
         model.prior.conclude(data.posterior(model))
         seconds = running["seconds"] + time.perf_counter() - last
-        smoothed = {name: float(value) for name, value in running["terms"].items()}
+        smoothed = {term: float(value) for term, value in running["terms"].items()}
         return {**smoothed, "seconds_training": seconds}
 
     def _step(
@@ -95,15 +97,17 @@ class Trainer:
         optimiser: torch.optim.Adam,
         batch: Minibatch,
         kl_weight: float,
-        weights: tuple[float, float],
+        scale: float,
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """A step of Adam on the networks and one of natural gradient on the prior."""
-        loss, segments, terms = model.loss(batch, kl_weight)
+        loss, statistics, terms = model.loss(batch, kl_weight)
         optimiser.zero_grad()
         torch.autograd.backward(loss)
-        torch.nn.utils.clip_grad_norm_(model.networks.parameters(), self.settings.clip)
+        torch.nn.utils.clip_grad_norm_(
+            model.networks.parameters(), self.settings.clip, foreach=True
+        )
         optimiser.step()
-        model.prior.learn(Segments(*(part.detach() for part in segments)), weights)
+        model.prior.learn(statistics, scale)
         return loss.detach(), terms
 
     def _rate(self, share: float, fine_tuning: bool) -> float:
@@ -121,12 +125,12 @@ class Trainer:
         return settings.kl_start + rise * (settings.kl_end - settings.kl_start)
 
     @staticmethod
-    def _smooth(terms: dict[str, float], new: dict[str, Tensor]) -> None:
+    def _smooth(terms: dict[str, Tensor], new: dict[str, Tensor]) -> None:
         for name, value in new.items():
             # Kept as tensors: reading a number would wait for the device at every step.
             value = value.detach().double()
             old = terms.get(name)
-            terms[name] = value if old is None else SMOOTHING * old + (1 - SMOOTHING) * value  # type: ignore[assignment]
+            terms[name] = value if old is None else SMOOTHING * old + (1 - SMOOTHING) * value
 
     @property
     def under_way(self) -> bool:
@@ -148,51 +152,69 @@ class Trainer:
 
 
 class Dataset:
-    """Batches of episodes on the device, and minibatches of segments from them."""
+    """Batches of episodes on the device, and minibatches of segments from them.
+
+    Segments are of live steps only; an episode that ended before it was as long as one has none.
+    """
 
     def __init__(self, batches: list[Episodes], device: str) -> None:
         self.device = device
         self.episodes = Episodes.joined(batches)
         self.newest = len(batches[-1])
-        self.frames = torch.from_numpy(self.episodes.frames).to(device)
-        self.actions = torch.from_numpy(self.episodes.actions).to(device)
+        if (longest := self.episodes.lengths.max()) < self.episodes.window:
+            raise SolarError(
+                f"none of {len(self.episodes)} episodes lasts longer than {longest} steps: there "
+                f"is no transition between windows of {self.episodes.window} frames to learn from; "
+                "choose a smaller window, or exploration that ends episodes later"
+            )
+        self.frames = torch.from_numpy(self.episodes.frames).to(device).flatten(0, 1)
+        self.actions = torch.from_numpy(self.episodes.actions).to(device).flatten(0, 1)
 
     def minibatch(
         self, settings: Training, stream: np.random.Generator, latent: int, favour_newest: bool
     ) -> Minibatch:
         """Random segments; with ``favour_newest`` half of them from the newest batch."""
-        count, frames = len(self.episodes), self.episodes.horizon + 1
-        length = min(settings.length, frames)
+        length = min(settings.length, int(self.episodes.lengths.max()) + 1)
         segments = settings.segments
-        rows = stream.integers(count, size=segments)
-        if favour_newest:
+        firsts = self._firsts(length)
+        # Each episode as often as it has segments, which are then equally likely.
+        often = firsts // np.gcd.reduce(firsts)
+        tickets = np.repeat(np.arange(len(firsts)), often)
+        drawn = stream.integers(len(tickets), size=segments)
+        if favour_newest and (newest := int(often[-self.newest :].sum())):
             half = segments // 2
-            rows[:half] = count - 1 - stream.integers(self.newest, size=half)
-        starts = stream.integers(frames - length + 1, size=segments)
+            drawn[:half] = len(tickets) - 1 - stream.integers(newest, size=half)
+        rows = tickets[drawn]
+        starts = stream.integers(firsts[rows])
         noise = stream.standard_normal((segments, length, latent), dtype=np.float32)
         decoded = stream.permutation(segments * length)
         decoded = decoded[: max(1, round(settings.decoded * segments * length))]
-        row = torch.from_numpy(rows).to(self.device)[:, None]
-        start = torch.from_numpy(starts).to(self.device)
-        times = start[:, None] + torch.arange(length, device=self.device)
+        horizon = self.episodes.horizon
+        places = (rows * (horizon + 1) + starts)[:, None] + np.arange(length)
+        moves = (rows * horizon + starts)[:, None] + np.arange(length - 1)
         return Minibatch(
-            self.frames[row, times],
-            self.actions[row, times[:, :-1]],
-            start,
+            self._taken(self.frames, places),
+            self._taken(self.actions, moves),
+            torch.from_numpy(starts).to(self.device),
             torch.from_numpy(noise).to(self.device),
             torch.from_numpy(decoded).to(self.device),
+            torch.from_numpy(firsts[rows]).to(self.device),
         )
 
-    def weights(self, batch: Minibatch) -> tuple[float, float]:
-        """B of Eq. 6: how many times a minibatch goes into the data, by transitions and by starts.
+    def _taken(self, flat: Tensor, places: NDArray[np.int64]) -> Tensor:
+        """Entries (S, n, ...) of an array whose episodes lie end to end."""
+        chosen = flat.index_select(0, torch.from_numpy(places.ravel()).to(self.device))
+        return chosen.view(*places.shape, *flat.shape[1:])
 
-        L frames hold L - W transitions between windows of W; a segment starts an episode with
-        probability 1 / (T - L + 2).
-        """
+    def scale(self, batch: Minibatch) -> float:
+        """B of Eq. 6: episodes that a segment of the minibatch stands for."""
         segments, length = batch.frames.shape[:2]
-        count, horizon, window = len(self.episodes), self.episodes.horizon, self.episodes.window
-        transitions = count * (horizon + 1 - window) / (segments * (length - window))
-        return transitions, count * (horizon - length + 2) / segments
+        starts = self.episodes.horizon + 2 - length
+        return float(self._firsts(length).sum() / starts / segments)
+
+    def _firsts(self, length: int) -> NDArray[np.int64]:
+        """(N,) segments of ``length`` frames that each episode has."""
+        return np.asarray(np.maximum(self.episodes.lengths + 2 - length, 0))
 
     def posterior(self, model: LatentModel) -> Segments:
         """q(z | s) of every episode."""

@@ -29,6 +29,7 @@ from solar_cli.reporting.statistics import (
 from solar_cli.reporting.summary import caveats, title
 from solar_cli.reporting.tables import Table, bounded, interval, markdown, number, one_line
 from solar_cli.store.store import Store
+from solar_cli.wording import counted
 
 BASELINE = "solar"
 
@@ -42,7 +43,8 @@ class Side:
     label: str
     mean: float
     """final performance"""
-    std: float
+    std: float | None
+    """over seeds; None for one"""
     episodes: int
     """where the curve ends, and its final performance is taken"""
     seeds: int
@@ -198,9 +200,7 @@ def compare_curves(problem: Problem, left: Curve, right: Curve, said: list[str])
 
 
 def _side(curve: Curve) -> Side:
-    return Side(
-        curve.label, float(curve.mean[-1]), float(curve.std[-1]), curve.end, len(curve.seeds)
-    )
+    return Side(curve.label, float(curve.mean[-1]), curve.final_std, curve.end, len(curve.seeds))
 
 
 def judge(better: float, p: float, left_seeds: int, right_seeds: int) -> tuple[Verdict, str]:
@@ -208,7 +208,7 @@ def judge(better: float, p: float, left_seeds: int, right_seeds: int) -> tuple[V
     smallest = smallest_p(left_seeds, right_seeds)
     if smallest > LEVEL:
         return "undecided", (
-            f"{left_seeds} against {right_seeds} seeds cannot reach p <= {LEVEL}: "
+            f"{left_seeds} against {counted(right_seeds, 'seed')} cannot reach p <= {LEVEL}: "
             f"the smallest p is {smallest:.2g}"
         )
     if p > LEVEL:

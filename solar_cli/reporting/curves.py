@@ -112,12 +112,17 @@ class Curve:
         return mean
 
     @property
-    def std(self) -> Array:
-        """Sample standard deviation over seeds, shape (grid,); 0 for one seed."""
+    def std(self) -> Array | None:
+        """Sample standard deviation over seeds, shape (grid,); None for one seed."""
         if len(self.seeds) == 1:
-            return np.zeros(len(self.grid))
+            return None
         std: Array = self.values.std(axis=0, ddof=1)
         return std
+
+    @property
+    def final_std(self) -> float | None:
+        """`std` at the end of the curve."""
+        return None if self.std is None else float(self.std[-1])
 
     @property
     def final(self) -> Array:

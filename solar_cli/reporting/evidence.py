@@ -11,6 +11,7 @@ from solar_cli.reporting.curves import Curve
 from solar_cli.reporting.tables import number, ranges
 from solar_cli.store.records import CellRecord, State
 from solar_cli.store.store import Store
+from solar_cli.wording import counted, plural
 
 
 def codes(store: Store, curve: Curve) -> dict[str, list[int]]:
@@ -48,20 +49,21 @@ def notes(store: Store, curve: Curve, present: Mapping[str, Any]) -> list[str]:
         seed, name = seeds.get(record.hash), f"seed {record.cell.seed}"
         error = record.last_attempt.error if record.last_attempt else None
         cause = f": {error}" if error else ""
+        reached = "" if seed is None else counted(int(seed.episodes[-1]), "episode")
         if seed is None:
             lines.append(f"{name} is {record.state.value} and has no value: it is left out{cause}")
         elif seed.diverged:
             lines.append(
-                f"{name} diverged after {seed.episodes[-1]} episodes and counts as "
+                f"{name} diverged after {reached} and counts as "
                 f"{number(seed.penalty)} from there on{cause}"
             )
         elif record.state is not State.FINISHED:
-            lines.append(f"{name} is {record.state.value} at {seed.episodes[-1]} episodes{cause}")
+            lines.append(f"{name} is {record.state.value} at {reached}{cause}")
     longest = max(int(seed.episodes[-1]) for seed in curve.seeds)
     if longest > curve.end:
         short = [seed.seed for seed in curve.seeds if seed.end == curve.end]
         lines.append(
-            f"ends at {curve.end} of {longest} episodes, where its shortest seed ends "
+            f"ends at {curve.end} of {counted(longest, 'episode')}, where its shortest seed ends "
             f"({ranges(short)})"
         )
     return [f"{curve.label}: {line}" for line in lines]
@@ -71,11 +73,16 @@ def _code_notes(store: Store, curve: Curve, present: Mapping[str, Any]) -> list[
     names = codes(store, curve)
     lines = []
     if len(names) > 1:
-        parts = [f"{name} (seeds {ranges(seeds)})" for name, seeds in names.items()]
+        parts = [f"{name} ({_named(seeds)})" for name, seeds in names.items()]
         lines.append(f"seeds or attempts of different code in one curve: {'; '.join(parts)}")
     elif any(" with changes" in name for name in names):
         lines.append(f"computed with uncommitted changes: {next(iter(names))}")
     stale = [seed.seed for seed in curve.seeds if is_stale(seed.record, present)]
     if stale:
-        lines.append(f"stale: seeds {ranges(stale)} were not computed by {code_label(present)}")
+        lines.append(f"stale: {code_label(present)} did not compute {_named(stale)}")
     return lines
+
+
+def _named(seeds: list[int]) -> str:
+    """``seed 3`` or ``seeds 0-4, 7``."""
+    return f"{plural('seed', len(seeds))} {ranges(seeds)}"

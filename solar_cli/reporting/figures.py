@@ -20,6 +20,7 @@ from solar_cli.reporting.curves import Curve, Problem, SeedCurve
 from solar_cli.reporting.summary import title
 from solar_cli.reporting.tables import number
 from solar_cli.store.records import State
+from solar_cli.wording import counted
 
 FileFormat = Literal["png", "svg", "pdf"]
 
@@ -109,7 +110,8 @@ def _draw(axes: Axes, curve: Curve, colour: str, dashes: tuple[float, ...]) -> N
             held = (seed.episodes[-1], curve.end)
             axes.plot(held, [seed.penalty] * 2, ":", color=colour, linewidth=0.9, alpha=0.6)
     mean, std = curve.mean, curve.std
-    axes.fill_between(curve.grid, mean - std, mean + std, color=colour, alpha=0.18, linewidth=0)
+    if std is not None:
+        axes.fill_between(curve.grid, mean - std, mean + std, color=colour, alpha=0.18, linewidth=0)
     axes.plot(
         curve.grid,
         mean,
@@ -134,7 +136,7 @@ def label(curve: Curve) -> str:
     diverged = sum(seed.diverged for seed in curve.seeds)
     failed = curve.count(State.FAILED)
     unfinished = curve.count(State.PENDING, State.RUNNING, State.INTERRUPTED)
-    lines = [f"{curve.label}, {count} seed{'s' * (count != 1)}"]
+    lines = [f"{curve.label}, {counted(count, 'seed')}"]
     lines += [f"{diverged} diverged (×)"] * bool(diverged)
     lines += [f"{failed} failed (+)"] * bool(failed)
     lines += [f"{unfinished} unfinished"] * bool(unfinished)

@@ -19,6 +19,7 @@ from solar_cli.reporting.tables import Table
 from solar_cli.settings import TaskSettings
 from solar_cli.store.records import ArtifactRecord, CellRecord, State
 from solar_cli.store.store import Store
+from solar_cli.wording import counted
 
 MEMORY = "peak_memory_bytes"
 """Metric of the training split, where a worker measures it."""
@@ -200,9 +201,7 @@ def _origin(provenance: Mapping[str, Any]) -> tuple[str, ...]:
     memory = hardware.get("memory_bytes")
     machine = [
         hardware.get("processor"),
-        f"{hardware['cores']} core{'s' * (hardware['cores'] != 1)}"
-        if "cores" in hardware
-        else None,
+        counted(hardware["cores"], "core") if "cores" in hardware else None,
         f"{memory / 2**30:.0f} GiB" if memory else None,
         *hardware.get("gpus", []),
         hardware.get("system"),

@@ -16,8 +16,10 @@ from solar_cli.reporting.statistics import (
     typical_episodes,
 )
 from solar_cli.reporting.tables import Table, bounded, interval, number
+from solar_cli.reporting.timing import note, shares
 from solar_cli.store.records import State
 from solar_cli.store.store import Store
+from solar_cli.wording import counted
 
 INTERVALS = "Intervals are 95 % stratified bootstrap intervals over seeds."
 COVERS = (
@@ -57,7 +59,8 @@ class Summary:
     episodes: int
     """at the end of the curve, where the numbers are taken"""
     mean: float
-    std: float
+    std: float | None
+    """over seeds; None for one"""
     iqm: float
     interval: Interval | None
     """of the IQM"""
@@ -87,7 +90,7 @@ def summarise(
         unfinished=curve.count(State.PENDING, State.RUNNING, State.INTERRUPTED),
         episodes=curve.end,
         mean=float(curve.mean[-1]),
-        std=float(curve.std[-1]),
+        std=curve.final_std,
         iqm=float(iqm(curve.final)),
         interval=iqm_interval(curve.final),
         levels=tuple(
@@ -97,7 +100,10 @@ def summarise(
         seconds=sum(seed.record.seconds for seed in curve.seeds) / len(curve.seeds),
         memory_bytes=max(peaks, default=None),
         codes=tuple(codes(store, curve)),
-        notes=tuple(notes(store, curve, present)),
+        notes=(
+            *notes(store, curve, present),
+            *note(curve.label, shares(store, [seed.record for seed in curve.seeds])),
+        ),
     )
 
 
@@ -150,7 +156,7 @@ def caveats(intervals: Iterable[Interval | None]) -> list[str]:
 
 def mean_and_spread(summary: Summary) -> str:
     """``0.3 ± 0.1``; of a single seed, which has no spread, ``0.3 ± –``."""
-    return f"{number(summary.mean)} ± {number(summary.std) if summary.seeds > 1 else '–'}"
+    return f"{number(summary.mean)} ± {'–' if summary.std is None else number(summary.std)}"
 
 
 def title(measure: str, unit: str, better: str) -> str:
@@ -182,7 +188,7 @@ def line(problem: Problem, summary: Summary) -> str:
     unit = f" {measure.unit}" if measure.unit else ""
     return (
         f"{problem.title} {summary.label}: {measure.headline} {mean_and_spread(summary)}"
-        f"{unit} after {summary.episodes} episodes, seeds: {seeds(summary)}, "
+        f"{unit} after {counted(summary.episodes, 'episode')}, seeds: {seeds(summary)}, "
         f"code: {', '.join(summary.codes) or 'unknown'}"
     )
 

@@ -11,13 +11,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
 
 from solar_cli.errors import UsageError, nearest
 from solar_cli.settings.registry import method, method_names, settings_class
-from solar_cli.settings.schema import Settings, setting
+from solar_cli.settings.schema import Settings, converted, setting
 from solar_cli.settings.task import EvaluationSettings, TaskSettings
 
 PACKAGED = Path(__file__).parent.parent / "_tasks"
@@ -117,7 +117,7 @@ def _read(path: Path) -> Card:
     if "extends" in tables:
         tables = _extended(tables, path)
     card = Card(path.stem, path, tables)
-    _validated(CardTables, tables, f"card {path}")
+    validated(CardTables, tables, f"card {path}")
     for variant in card.variants:
         for name in tables.get("methods", {}):
             # Methods of packages that are not installed here are left to those who have them.
@@ -187,9 +187,9 @@ def resolve(
         origins.update({path: origin for path in _leaves(tree)})
     where = f"task {card.name!r}, method {method_name!r}, variant {variant!r}"
     configuration = Configuration.model_construct(
-        task=_validated(TaskSettings, merged["task"], where, "task"),
-        evaluation=_validated(EvaluationSettings, merged["evaluation"], where, "evaluation"),
-        method=_validated(settings_class(entry), merged["method"], where, f"methods.{method_name}"),
+        task=validated(TaskSettings, merged["task"], where, "task"),
+        evaluation=validated(EvaluationSettings, merged["evaluation"], where, "evaluation"),
+        method=validated(settings_class(entry), merged["method"], where, f"methods.{method_name}"),
     )
     if configuration.task.observation.kind not in entry.observations:
         raise UsageError(
@@ -293,10 +293,13 @@ def _leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterable[str]:
             yield path
 
 
-def _validated(model: type[S], table: Any, where: str, path: str = "") -> S:
-    """Validate, or say every mistake in one line: where, which key, what was expected."""
+def validated(model: type[S], table: Any, where: str, path: str = "") -> S:
+    """Validate, or say every mistake in one line: where, which key, what was expected.
+
+    ``path`` is that of the table, which keys are named with.
+    """
     try:
-        return model.model_validate(table)
+        made = model.model_validate(table)
     except ValidationError as error:
         mistakes = []
         for fault in error.errors(include_url=False):
@@ -308,15 +311,30 @@ def _validated(model: type[S], table: Any, where: str, path: str = "") -> S:
                 given = "" if fault["type"] == "missing" else f", not {fault['input']!r}"
                 mistakes.append(f"{key!r}: {fault['msg']}{given}")
         raise UsageError(f"{where}: {'; '.join(mistakes)}") from error
+    mistakes = [
+        f"{key!r}: Input should be {expected}, not {given!r}"
+        for key, expected, given in converted(table, made, path)
+    ]
+    if mistakes:
+        raise UsageError(f"{where}: {'; '.join(mistakes)}")
+    return made
 
 
 def _siblings(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
     """The keys that stand beside an unknown one."""
     for part in location[:-1]:
         field = model.model_fields.get(str(part))
-        if field is None or not (
-            isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)
-        ):
+        if field is None:  # a name that the user chose, in a table of tables
+            continue
+        inner = _models(field.annotation)
+        if len(inner) != 1:
             return []
-        model = field.annotation
-    return list(model.model_fields)
+        model = inner[0]
+    return [field.alias or name for name, field in model.model_fields.items()]
+
+
+def _models(annotation: Any) -> list[type[BaseModel]]:
+    """The models in a type such as ``dict[str, Model] | None``."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for part in get_args(annotation) for model in _models(part)]

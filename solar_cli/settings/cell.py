@@ -142,13 +142,13 @@ def _concerns(text: str, method_name: str) -> bool:
 
 
 def parse_seeds(text: str) -> list[int]:
-    """``3`` is 0, 1, 2; ``3,5,8`` are those; ``0:10`` is 0 to 9 and ``5:6`` is 5."""
+    """``3`` is 0, 1, 2; ``3,5,8`` are those and ``5,`` is 5; ``0:10`` is 0 to 9."""
     try:
         if ":" in text:
             first, last = (int(part) for part in text.split(":"))
             seeds = list(range(first, min(last, first + MOST_SEEDS + 1)))
         elif "," in text:
-            seeds = [int(part) for part in text.split(",") if part.strip()]
+            seeds = [int(part) for part in text.strip().removesuffix(",").split(",")]
         else:
             seeds = list(range(min(int(text), MOST_SEEDS + 1)))
     except ValueError as error:

@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from solar_cli.settings.networks import FULLY_CONNECTED, KEY_POINTS, Layer
+from solar_cli.settings.networks import BUMPS, KEY_POINTS, Layer
 from solar_cli.settings.schema import Settings, setting
 
 Positive = Annotated[float, Field(gt=0)]
@@ -42,16 +42,18 @@ class Representation(Settings):
     variance: Positive | Literal["learned"] = setting(
         "learned", "variance of q(z|s): a learned diagonal, or this number"
     )
-    decoder: tuple[Layer, ...] = setting(FULLY_CONNECTED, "hidden layers of the observation model")
+    decoder: tuple[Layer, ...] = setting(BUMPS, "observation network, applied to each frame")
     likelihood: Literal["calibrated", "bernoulli", "categorical", "gaussian"] = setting(
         "calibrated",
         "p(s|z): Gaussian with the best common scale on an image pyramid, or as App. D says",
     )
     nats: float = setting(
-        64.0, "calibrated: half the dimensions of a frame that count, weight of the log error", gt=0
+        512.0,
+        "calibrated: half the dimensions of a frame that count, weight of the log error",
+        gt=0,
     )
     pyramid: bool = setting(
-        True, "calibrated: errors of pooled frames count too, so that small misplaced things do"
+        False, "calibrated: errors of pooled frames count too, so that small misplaced things do"
     )
     input: Literal["standardised", "unit"] = setting(
         "standardised", "(x - mean image) / pixel std, or x in [0, 1]"
@@ -144,7 +146,7 @@ class PolicyUpdate(Settings):
     kl_step: Positive | Literal["unbounded"] = setting(
         0.5, "nats a time step that the trajectory distribution may move"
     )
-    multiplier: tuple[Positive, Positive] = setting((0.3, 2.0), "bounds of the adaptive step size")
+    multiplier: tuple[Positive, Positive] = setting((0.3, 4.0), "bounds of the adaptive step size")
     linearise: bool = setting(True, "line 6 of Algorithm 1, when e(s) has changed")
     reject: Annotated[float, Field(ge=0)] | Literal["never"] = setting(
         1.0, "standard errors by which a batch may be worse than the best before going back"

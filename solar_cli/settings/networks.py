@@ -33,7 +33,9 @@ class SpatialSoftmax(Settings):
     """Expected image coordinates of every channel, in [-1, 1] (Finn et al. 2016)."""
 
     kind: Literal["spatial_softmax"] = "spatial_softmax"
-    log_sharpness: float = setting(1.0, "initial log of the factor on the maps, learned")
+    log_sharpness: float = setting(
+        -3.0, "initial log of the factor on the maps, learned: a soft one reads below a pixel"
+    )
 
 
 class Linear(Settings):
@@ -76,9 +78,9 @@ KEY_POINTS: tuple[Layer, ...] = (
     Conv(channels=16, size=3, padding=1),
     Conv(channels=16, size=3, padding=1),
     Conv(channels=32, size=1, activation="none"),
-    SpatialSoftmax(log_sharpness=1.0),
+    SpatialSoftmax(),
 )
 """Our encoder for every image task: key points of a frame at a quarter of its resolution."""
 
-FULLY_CONNECTED: tuple[Layer, ...] = (Linear(width=256), Linear(width=256), Linear(width=256))
-"""Our decoder for every image task."""
+BUMPS: tuple[Layer, ...] = (Bumps(points=32),)
+"""Our decoder for every image task: what moves in a frame, drawn at what moves in the latents."""

@@ -9,6 +9,7 @@ The hash of a cell is made of every field, but for two kinds, marked where they 
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -72,6 +73,26 @@ def completed(settings: type[BaseModel], stored: dict[str, Any]) -> dict[str, An
         elif isinstance(inner, type) and issubclass(inner, BaseModel) and name in values:
             values[name] = completed(inner, values[name])
     return values
+
+
+def converted(given: Any, checked: Any, path: str = "") -> Iterator[tuple[str, str, Any]]:
+    """(path, kind expected, value given) of what pydantic made a number or a truth value of.
+
+    ``true`` for 1, ``"3"`` for 3 and 1 for ``true`` are slips of the pen, not ways to say it.
+    """
+    if isinstance(given, Mapping):
+        for name, value in given.items():
+            known = isinstance(checked, Mapping)
+            inner = checked.get(name) if known else getattr(checked, name, None)
+            yield from converted(value, inner, f"{path}.{name}" if path else name)
+    elif isinstance(given, list) and isinstance(checked, list | tuple):
+        for index, (value, inner) in enumerate(zip(given, checked, strict=False)):
+            yield from converted(value, inner, f"{path}.{index}")
+    elif isinstance(checked, int | float):
+        expected = "true or false" if isinstance(checked, bool) else "a number"
+        same = isinstance(given, bool) == isinstance(checked, bool)
+        if not (same and isinstance(given, int | float)):
+            yield path, expected, given
 
 
 def source_of(settings: type[BaseModel], path: tuple[str, ...]) -> tuple[str, str]:

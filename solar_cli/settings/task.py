@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
 
 from solar_cli.settings.schema import Settings, setting
 
@@ -66,4 +68,7 @@ class EvaluationSettings(Settings):
     unit: str = setting("", "unit of the headline measure", presentation=True)
     levels: tuple[float, ...] = setting(
         (), "levels for 'episodes to reach', committed before the runs", presentation=True
+    )
+    milestones: tuple[Annotated[int, Field(ge=1)], ...] = setting(
+        (), "episodes from which on the first checkpoint is kept for good", presentation=True
     )

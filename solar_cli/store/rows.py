@@ -1,4 +1,7 @@
-"""Between rows and records: what a cell is now, stored settings, numbers that are not finite."""
+"""Between rows and records: what a cell is now, stored settings, numbers that are not finite.
+
+numpy is imported where there are arrays: to see that a matrix is finished takes none.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +11,8 @@ from collections.abc import Callable
 from dataclasses import asdict, fields
 from datetime import datetime, timedelta
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import ConfigDict, ValidationError
 
 from solar_cli.errors import SolarError
@@ -29,9 +30,13 @@ from solar_cli.store.records import (
 )
 from solar_cli.store.schema import AttemptRow, CellRow, CheckpointRow
 
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
 LEASE = timedelta(seconds=60)
 """A process that cannot be looked up counts as gone when its last heartbeat is older."""
-LITTLE_ENDIAN = np.dtype("<f8")
+LITTLE_ENDIAN = "<f8"
 NOT_FINITE = {"nan": math.nan, "+inf": math.inf, "-inf": -math.inf}
 
 
@@ -174,6 +179,8 @@ def array(values: bytes | None) -> NDArray[np.float64] | None:
     """One number an episode, shape (N,)."""
     if values is None:
         return None
+    import numpy as np
+
     return np.frombuffer(values, LITTLE_ENDIAN).astype(np.float64)
 
 

@@ -1,4 +1,4 @@
-"""Speed of the navigation task against peers in the same run; nothing is asserted.
+"""Speed of the tasks against peers in the same run; nothing is asserted.
 
 OMP_NUM_THREADS=1 python -m pytest tests/benchmarks/bench_envs.py -s
 """
@@ -15,11 +15,13 @@ from gymnasium.vector import AutoresetMode
 
 from solar_cli.envs import build_task
 from solar_cli.envs.front_ends import IDS
-from solar_cli.envs.rasteriser import draw_blobs
+from solar_cli.envs.offscreen import load_mujoco, make_renderer
+from solar_cli.envs.rasteriser import Box, Disc, draw_blobs, draw_figure
+from solar_cli.envs.reacher import MODEL
 from solar_cli.settings import load_card
 
 BATCH = 128
-ID = next(iter(IDS))
+NAMES = ["Solar/Navigation-v0", "Solar/Car-v0", "Solar/CarStates-v0", "Solar/Reacher-v0"]
 
 
 def hardware():
@@ -52,33 +54,36 @@ def hardware_line():
     print(f"\n{hardware()}")
 
 
-def actions():
-    return np.random.default_rng(0).normal(0.0, 0.1, (BATCH, 2))
+def actions(settings, batch):
+    return np.random.default_rng(0).normal(0.0, settings.exploration.std, (batch, 2))
 
 
-@pytest.mark.parametrize("batch", [1, 16, 128, 256])
-def test_task(batch):
-    task = build_task(load_card("nav").task)
+@pytest.mark.parametrize("card", [IDS[name] for name in NAMES])
+@pytest.mark.parametrize("batch", [1, 16, 64, 128, 256])
+def test_task(card, batch):
+    settings = load_card(card).task
+    task = build_task(settings)
     task.reset([np.random.default_rng(i) for i in range(batch)])
-    moves = np.resize(actions(), (batch, 2))
-    print(f"core, batch {batch}: {rate(lambda: task.step(moves), batch):,.0f} steps/s")
+    moves = actions(settings, batch)
+    print(f"{card}, core, batch {batch}: {rate(lambda: task.step(moves), batch):,.0f} steps/s")
 
 
-def test_batched_environment_against_a_loop_over_singles():
-    batched = gymnasium.make_vec(ID, num_envs=BATCH)
+@pytest.mark.parametrize("name", NAMES)
+def test_batched_environment_against_a_loop_over_singles(name):
+    batched = gymnasium.make_vec(name, num_envs=BATCH)
     loop = gymnasium.make_vec(
-        ID,
+        name,
         num_envs=BATCH,
         vectorization_mode="sync",
         vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP},
     )
-    moves = actions().astype(np.float32)
+    moves = actions(load_card(IDS[name]).task, BATCH).astype(np.float32)
     speeds = []
     for env in (batched, loop):
         env.reset(seed=0)
         speeds.append(rate(lambda env=env: env.step(moves), BATCH))
     print(
-        f"Gymnasium, batch {BATCH}: batched {speeds[0]:,.0f} steps/s, SyncVectorEnv "
+        f"{name}, Gymnasium, batch {BATCH}: batched {speeds[0]:,.0f} steps/s, SyncVectorEnv "
         f"{speeds[1]:,.0f}: {speeds[0] / speeds[1]:.1f} times"
     )
 
@@ -100,4 +105,36 @@ def test_rasteriser_against_whole_frames():
     print(
         f"blobs, batch {BATCH}: patches {ours:,.0f} images/s, whole frames {peer:,.0f}: "
         f"{ours / peer:.1f} times; equal images: {np.array_equal(patches, whole)}"
+    )
+
+
+def test_figures_against_whole_frames():
+    figure = (Box((0.0, 0.0), (7.2, 3.6), 255.0), Box((2.4, 0.0), (1.4, 2.9), 0.0))
+    everywhere = (*figure, Disc((500.0, 0.0), 0.0, 0.0))  # shows nowhere, but reaches far
+    draws = np.random.default_rng(0)
+    centres, headings = draws.uniform(4, 59, (BATCH, 2)), draws.uniform(-3, 3, BATCH)
+    images = np.zeros((BATCH, 64, 64), np.uint8)
+    ours = rate(lambda: draw_figure(images, centres, headings, figure), BATCH)
+    peer = rate(lambda: draw_figure(images, centres, headings, everywhere), BATCH)
+    print(
+        f"figures, batch {BATCH}: patches {ours:,.0f} images/s, whole frames {peer:,.0f}: "
+        f"{ours / peer:.1f} times"
+    )
+
+
+def test_drawing_against_mujocos_own_quality():
+    mujoco, speeds = load_mujoco(), []
+    for own in (True, False):
+        model = mujoco.MjModel.from_xml_path(str(MODEL))
+        if not own:
+            usual = mujoco.MjModel.from_xml_string("<mujoco/>").vis.quality
+            for name in ("numslices", "numstacks", "offsamples", "shadowsize"):
+                setattr(model.vis.quality, name, getattr(usual, name))
+        data, renderer = mujoco.MjData(model), make_renderer(model, 64, 64)
+        mujoco.mj_forward(model, data)
+        renderer.update_scene(data, "above")
+        speeds.append(rate(renderer.render, 1))
+    print(
+        f"reacher, drawing: {speeds[0]:,.0f} images/s, with MuJoCo's own quality "
+        f"{speeds[1]:,.0f}: {speeds[0] / speeds[1]:.1f} times"
     )

@@ -173,6 +173,7 @@ def white_noise(configuration):
 def test_training_against_bare_steps(name):
     torch.set_num_threads(1)
     torch.use_deterministic_algorithms(True)  # as in a worker
+    torch.utils.deterministic.fill_uninitialized_memory = False
     configuration = resolve(load_card(name), "solar").configuration
     settings = configuration.method
     episodes = white_noise(configuration)

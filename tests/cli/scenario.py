@@ -3,11 +3,13 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from stored_cells import store_attempt
 
 from solar_cli.settings import Cell
-from solar_cli.store.records import Metric, Outcome, Owner
+from solar_cli.store.records import Metric, Outcome
 from solar_cli.store.store import Store
 
 HOSTILE = "boom \x1b[31mred\x1b[0m [bold]not bold[/bold]\r\nsecond line\x07"
@@ -57,21 +59,13 @@ def compute(
     error: str | None = None,
 ) -> None:
     """Store what a worker would have stored, 8 episodes an iteration."""
-    attempt = store.claim(cell.hash, Owner.current(), 16, provenance)
-    for iteration, distance in enumerate(distances):
-        values = np.full(8, distance)
-        store.commit(
-            cell.hash,
-            attempt,
-            iteration=iteration,
-            episodes=8 * iteration,
-            steps=80 * iteration,
-            simulated_seconds=80.0 * iteration,
-            seconds=2.5 * iteration,
-            metrics=[
-                Metric("final_distance", distance, "noise_free", values),
-                Metric("return", -distance, "noise_free", -values),
-                Metric("elbo", float("-inf"), "train"),
-            ],
-        )
-    store.end(cell.hash, attempt, outcome, error)
+    iterations = [
+        [
+            Metric("final_distance", distance, "noise_free", np.full(8, distance)),
+            Metric("return", -distance, "noise_free", np.full(8, -distance)),
+            Metric("elbo", float("-inf"), "train"),
+        ]
+        for distance in distances
+    ]
+    pace: dict[str, Any] = {"episodes": 8, "steps": 80, "seconds": 2.5, "target": 16}
+    store_attempt(store, cell, iterations, outcome, provenance, error, **pace)

@@ -8,6 +8,10 @@ from pathlib import Path
 import pytest
 from scenario import Done, Solar, Stored
 
+from solar_cli.store.owner import Owner
+from solar_cli.store.records import Metric
+from solar_cli.store.store import Store
+
 CONTROLS = ("\x1b", "\x07", "\r")
 
 
@@ -281,3 +285,18 @@ def test_a_card_that_hides_a_built_in_one_is_told_of(solar: Solar, tmp_path: Pat
         assert "tasks/nav.toml is used instead of the built-in card 'nav'" in done.err
     assert solar(*run, "nav-fixed").err == ""
     assert solar(*run, "tasks/nav.toml").err == ""
+
+
+def test_show_says_where_the_time_went(solar: Solar, stored: Stored) -> None:
+    with Store.open(str(stored.db)) as store:
+        attempt = store.claim(stored.pending.hash, Owner.current(), 8, {})
+        spent = [Metric("seconds_training", 3.0), Metric("seconds_evaluating", 1.0)]
+        totals = {"steps": 80, "simulated_seconds": 80.0, "seconds": 5.0}
+        store.commit(stored.pending.hash, attempt, iteration=1, episodes=8, metrics=spent, **totals)
+    done = solar("show", stored.pending.hash, "--db", stored.db)
+    rows = [line.split() for line in done.out.splitlines()]
+    assert ["training", "networks", "3", "s", "60.0%"] in rows
+    assert ["evaluating", "1", "s", "20.0%"] in rows
+    entry = json.loads(solar("show", stored.pending.hash, "--json", "--db", stored.db).out)
+    assert [share["share"] for share in entry["time"]] == [0.6, 0.2, 0.2]
+    assert "Where the time went" not in solar("show", stored.second.hash, "--db", stored.db).out

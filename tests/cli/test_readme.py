@@ -14,16 +14,37 @@ def blocks(language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```$", TEXT, re.MULTILINE | re.DOTALL)
 
 
-def test_the_card_is_a_card(solar: Solar, tmp_path: Path) -> None:
-    [card] = [block for block in blocks("toml") if "[task]" in block]
-    [name] = re.findall(r"here `tasks/(.+?)\.toml`", TEXT)
+CARDS = dict(
+    zip(
+        re.findall(r"here\s`tasks/(.+?)\.toml`", TEXT),
+        [block for block in blocks("toml") if "[task]" in block],
+        strict=True,
+    )
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "parameter", "value"),
+    [("nav-left", "goal", [-1.0, 0.0]), ("pole", "id", "InvertedPendulum-v5")],
+)
+def test_a_card_is_a_card(
+    solar: Solar, tmp_path: Path, name: str, parameter: str, value: object
+) -> None:
     (tmp_path / "tasks").mkdir()
-    (tmp_path / "tasks" / f"{name}.toml").write_text(card)
+    (tmp_path / "tasks" / f"{name}.toml").write_text(CARDS[name])
     lines = {line["path"]: line for line in json.loads(solar("tasks", name, "--json").out)}
-    assert lines["task.parameters"]["value"] == {"goal": [-1.0, 0.0]}
+    assert lines["task.parameters"]["value"][parameter] == value
     done = solar("run", "--task", name, "--method", "solar", "--dry-run", "--json")
     [cell] = json.loads(done.out)
     assert (cell["task"], cell["action"], cell["target"]) == (name, "run", 240)
+
+
+def test_every_parameter_of_a_gymnasium_task_is_told() -> None:
+    from solar_cli.envs.gymnasium_card import Parameters
+
+    section = TEXT.split("## Bring a Gymnasium task")[1].split("\n## ")[0]
+    for name, field in Parameters.model_fields.items():
+        assert f"`{field.alias or name}`" in section
 
 
 def test_the_data_frame_has_the_columns_that_are_used(

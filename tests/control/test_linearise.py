@@ -31,12 +31,17 @@ def means(policy: LinearGaussianPolicy, z: torch.Tensor) -> torch.Tensor:
     return torch.einsum("tad,ntd->nta", policy.K, z) + policy.k
 
 
+def linearise(z, actions, policy):
+    """Episodes of which none ended early."""
+    return linearise_policy(z, actions, torch.ones(z.shape[:2], dtype=torch.bool), policy)
+
+
 def test_an_affine_change_of_the_latents_is_recovered_exactly():
     policy, z = acting_policy(1), latents(2)
     rng = np.random.default_rng(3)
     A = torch.as_tensor(rng.normal(size=(d, d)) + 2 * np.eye(d))
     b = torch.as_tensor(rng.normal(size=d))
-    fit = linearise_policy(z @ A.T + b, means(policy, z), policy)
+    fit = linearise(z @ A.T + b, means(policy, z), policy)
     expected = policy.K @ torch.linalg.inv(A)
     # The least ridge, 1e-10 variances, times the condition number of the new latents (1e4).
     torch.testing.assert_close(fit.policy.K, expected, rtol=1e-5, atol=1e-5)
@@ -52,7 +57,7 @@ def test_an_affine_change_of_the_latents_is_recovered_exactly():
 def test_left_out_errors_are_those_of_refitting_without_each_episode():
     policy, z = acting_policy(5), latents(6)
     actions = means(policy, z) + torch.as_tensor(np.random.default_rng(7).normal(size=(N, T, a)))
-    fit = linearise_policy(z, actions, policy)
+    fit = linearise(z, actions, policy)
     total, spread = 0.0, 0.0
     extra = np.zeros((T, a, a))
     for t in range(T):
@@ -74,7 +79,7 @@ def test_left_out_errors_are_those_of_refitting_without_each_episode():
 def test_unexplained_means_become_noise_of_the_policy():
     policy, z = acting_policy(8), latents(9, episodes=400)
     wobble = 0.5 * torch.as_tensor(np.random.default_rng(10).normal(size=(400, T, a)))
-    fit = linearise_policy(z, means(policy, z) + wobble, policy)
+    fit = linearise(z, means(policy, z) + wobble, policy)
     added = (fit.policy.S - policy.S).diagonal(dim1=-2, dim2=-1)
     # A variance from 400 samples has a standard error of 7 %.
     np.testing.assert_allclose(added, 0.25, rtol=0.35)
@@ -84,14 +89,14 @@ def test_unexplained_means_become_noise_of_the_policy():
 def test_noise_free_means_do_not_depend_on_a_constant_latent():
     policy, z = acting_policy(11), latents(12)
     z[..., 3] = 7.0
-    fit = linearise_policy(z, means(policy, z), policy)
+    fit = linearise(z, means(policy, z), policy)
     assert torch.all(fit.policy.K[..., 3].abs() < 1e-8)
     torch.testing.assert_close(means(fit.policy, z), means(policy, z), rtol=1e-6, atol=1e-6)
 
 
 def test_white_noise_stays_white_noise():
     policy, z = initial_policy(T, d, a, std=0.4), latents(13)
-    fit = linearise_policy(z, means(policy, z), policy)
+    fit = linearise(z, means(policy, z), policy)
     assert not fit.policy.K.any()
     assert torch.equal(fit.policy.S, policy.S)
     assert fit.residual == 0.0
@@ -99,7 +104,7 @@ def test_white_noise_stays_white_noise():
 
 def test_fewer_episodes_than_latents_still_reproduce_the_means_and_admit_doubt():
     policy, z = acting_policy(14), latents(15, episodes=3)
-    fit = linearise_policy(z, means(policy, z), policy)
+    fit = linearise(z, means(policy, z), policy)
     assert all(torch.isfinite(part).all() for part in fit.policy)
     assert fit.residual > 0.1
     assert torch.all(torch.linalg.eigvalsh(fit.policy.S - policy.S) > -1e-9)
@@ -108,4 +113,4 @@ def test_fewer_episodes_than_latents_still_reproduce_the_means_and_admit_doubt()
 def test_one_episode_is_an_error():
     policy, z = acting_policy(16), latents(17, episodes=1)
     with pytest.raises(ValueError, match="at least 2 episodes, got 1"):
-        linearise_policy(z, means(policy, z), policy)
+        linearise(z, means(policy, z), policy)

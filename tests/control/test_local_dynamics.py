@@ -67,7 +67,7 @@ def states(y, actions, window=1, basis=None) -> tuple[Trajectories, LatentBasis]
     basis = LatentBasis.whitening(w.flatten(0, 1)) if basis is None else basis
     executed = torch.as_tensor(actions)
     costs = torch.zeros(executed.shape[:2]).double()
-    return Trajectories(basis.state(w), executed, executed, costs), basis
+    return Trajectories(basis.state(w), executed, executed, costs, costs == 0), basis
 
 
 def infer(newest, basis, settings, older=(), factor=None, seed=0):

@@ -22,7 +22,8 @@ def batch(cost, seed=0, episodes=N, horizon=T, size=m, noise=0.0) -> Trajectorie
     actions = rng.normal(size=(episodes, horizon, a))
     costs = np.stack([cost(z[:, t], t) for t in range(horizon)], axis=1)
     costs += ALPHA * np.square(actions).sum(axis=-1) + noise * rng.normal(size=costs.shape)
-    return Trajectories(*map(torch.as_tensor, (z, actions, actions, costs)))
+    live = np.ones(costs.shape, np.bool_)
+    return Trajectories(*map(torch.as_tensor, (z, actions, actions, costs, live)))
 
 
 def quadratic(z, t=0, C=C, c=c, b=b):
@@ -225,7 +226,33 @@ def test_a_good_representation_is_not_taken_for_a_dead_one(seed):
     costs = np.square(place - goal).sum(axis=-1)[:, :-1]
     actions = np.zeros((60, 50, 2))
     learned, judge = (
-        Trajectories(*(torch.as_tensor(part[rows]) for part in (z, actions, actions, costs)))
+        Trajectories(
+            *(torch.as_tensor(part[rows]) for part in (z, actions, actions, costs, costs > -1))
+        )
         for rows in (slice(51), slice(51, None))
     )
     assert explained(fit(learned, features=4, per_time="never").model, judge) > 0.8
+
+
+def test_a_fit_per_time_step_is_a_weighted_regression_on_monomials():
+    """Where that is positive definite; samples of neighbouring steps weigh as a Gaussian."""
+    width, states = 1.3, batch(varying, episodes=200, noise=0.3)
+    z = states.z[:, :-1].numpy()
+    known = states.costs.numpy() - ALPHA * np.square(states.actions.numpy()).sum(axis=-1)
+    rows, columns = np.tril_indices(m)
+    monomials = np.concatenate([z[..., rows] * z[..., columns], z, np.ones((200, T, 1))], axis=-1)
+    found = fit(states, width=width)
+    assert found.per_time
+    for t in range(T):
+        distance = np.abs(np.arange(T) - t)
+        root = np.exp(-0.25 * np.square(distance / width)) * (distance <= 3)
+        left = (root[:, None] * monomials).reshape(-1, monomials.shape[-1])
+        w = np.linalg.lstsq(left, (root * known).ravel(), rcond=None)[0]
+        half = np.zeros((m, m))
+        half[rows, columns] = w[: len(rows)]
+        expected = half + half.T
+        assert np.linalg.eigvalsh(expected).min() > 0.05
+        # The pull towards the one fit of all time steps moves it by a little.
+        np.testing.assert_allclose(found.model.C[t, :m, :m], expected, atol=0.04)
+        np.testing.assert_allclose(found.model.c[t, :m], w[len(rows) : -1], atol=0.04)
+        np.testing.assert_allclose(found.model.b[t], w[-1], atol=0.04)

@@ -2,6 +2,7 @@
 
 import io
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -90,6 +91,12 @@ def test_the_tolerance_is_in_standard_errors(tolerance, taken_back):
     assert after(10.0, 11.5, tolerance=tolerance).rejected == taken_back
 
 
+def test_next_to_nothing_of_what_was_gained_is_tolerated_where_there_is_no_noise():
+    assert not after(100.0, 60.0, 60.7, error=1e-3).rejected
+    assert after(100.0, 60.0, 60.9, error=1e-3).rejected
+    assert after(100.0, 60.0, 60.7, 61.4, error=1e-3).rejected  # of the best, not of the last
+
+
 def test_without_rejection_anything_is_built_upon():
     state = after(10.0, 1e6, tolerance="never")
     assert state.current == tried(2, 1e6)
@@ -124,12 +131,20 @@ def test_the_best_never_gets_worse_nor_is_it_replaced_by_an_equal():
 
 
 def test_the_step_follows_what_was_promised_and_kept():
-    promised = region(promised=4.0, best=tried(1, 10.0), current=tried(1, 10.0))
+    promised = region(promised=4.0, first=10.0, best=tried(1, 10.0), current=tried(1, 10.0))
     assert promised.judged(tried(2, 6.0), 1.0).step == StepSize(low=0.3, high=2.0).after(4.0, 4.0)
     assert promised.judged(tried(2, 6.0), 1.0).step.multiplier == 2.0
     assert promised.judged(tried(2, 8.0), 1.0).step.multiplier == 1.0
     assert promised.judged(tried(2, 9.9), 1.0).step.multiplier < 0.6
     assert promised.judged(tried(2, 99.0), 1.0).step.multiplier == pytest.approx(0.4)
+
+
+def test_a_promise_that_is_small_beside_what_was_gained_makes_no_step_larger():
+    late = region(promised=4.0, first=100.0, best=tried(1, 10.0), current=tried(1, 10.0))
+    assert late.judged(tried(2, 6.0), 1.0).step.multiplier == 1.0
+    assert late.judged(tried(2, 9.9), 1.0).step.multiplier < 0.6  # but a smaller one
+    early = replace(late, first=80.0)
+    assert early.judged(tried(2, 6.0), 1.0).step.multiplier == 2.0
 
 
 def test_metrics_say_what_happened():
@@ -184,6 +199,16 @@ def test_a_promise_is_the_fall_of_what_is_collected():
     assert found == pytest.approx(collected(*before) - collected(*now), rel=1e-9)
 
 
+def test_an_update_is_handed_over_untried_for_a_twentieth_of_what_was_gained():
+    state = after(100.0, 80.0, 60.0, 70.0)  # the last one is taken back
+    assert state.first == 100.0
+    assert state.best.cost == 60.0
+    assert state.trusts(2.1)
+    assert not state.trusts(1.9)
+    assert not state.trusts(math.nan)
+    assert after(100.0).trusts(0.0)  # before anything was gained
+
+
 @pytest.mark.parametrize("costs", [(), (10.0,), (10.0, 11.0), (10.0, 20.0)])
 def test_a_saved_trust_region_goes_on_as_it_would_have(costs):
     state = after(*costs)
@@ -193,7 +218,7 @@ def test_a_saved_trust_region_goes_on_as_it_would_have(costs):
     restored = region().restored(torch.load(buffer, weights_only=True))
     for cost in (9.0, 12.0, 30.0):
         left, right = (s.judged(tried(7, cost), 1.0) for s in (state, restored))
-        for name in ("step", "kept", "rejected", "promised"):
+        for name in ("step", "kept", "rejected", "promised", "first"):
             assert str(getattr(left, name)) == str(getattr(right, name)), name
         for name in ("best", "current"):
             one, other = getattr(left, name), getattr(right, name)

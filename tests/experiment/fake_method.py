@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from solar_cli.episodes import Environment, Episodes, Evaluation
+from solar_cli.episodes import Episodes, Evaluation, Experience
 from solar_cli.methods import Diverged, Pulse
 from solar_cli.settings import MethodEntry, TaskSettings
 from solar_cli.settings.local import Budget
@@ -75,18 +75,18 @@ class Fake:
     def policy(self) -> FakePolicy:
         return FakePolicy(self.weights, self.task.exploration.std)
 
-    def iterate(self, environment: Environment) -> dict[str, float]:
-        environment.collect(self.policy, self.settings.batch)
-        cost = float(Episodes.joined(environment.recent(2)).costs.mean())
+    def iterate(self, experience: Experience) -> dict[str, float]:
+        experience.collect(self.policy, self.settings.batch)
+        cost = float(Episodes.joined(experience.recent(2)).costs.mean())
         while self.step < self.settings.steps:
-            self._fail(environment.iteration)
-            stream = self.streams.generator(environment.iteration, self.step)
+            self._fail(experience.iteration)
+            stream = self.streams.generator(experience.iteration, self.step)
             push = torch.from_numpy(stream.standard_normal(self.weights.shape))
             self.momentum = 0.9 * self.momentum + cost * push
             self.weights = self.weights + 0.01 * self.momentum
             self.step += 1
             self.pulse("walking", self.step / self.settings.steps)
-            self._hold(environment.iteration)
+            self._hold(experience.iteration)
         self.step = 0
         return {"norm": float(self.weights.norm()), "seconds_walking": time.perf_counter()}
 

@@ -1,12 +1,20 @@
-"""What cells will take is measured on finished cells that differ in their seed only."""
+"""What cells will take: measured on finished seeds of the same kind, and foreseen by size."""
 
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 
-from solar_cli.experiment.estimates import WORKER_BYTES, Estimate, estimate, measured_speeds
+from solar_cli.experiment.estimates import (
+    WORKER_BYTES,
+    Estimate,
+    estimate,
+    measured_speeds,
+    memory_needs,
+)
+from solar_cli.experiment.judge import Judge
 from solar_cli.experiment.matrix import Action, Plan
-from solar_cli.settings import Cell
+from solar_cli.settings import Cell, cells, load_card
 from solar_cli.store.owner import Owner
 from solar_cli.store.records import Outcome
 from solar_cli.store.store import Store
@@ -51,6 +59,42 @@ def test_time_and_disk_follow_the_pace_of_finished_seeds(
         Estimate(300.0, WORKER_BYTES, 1000),
         Estimate(0.0, 0, 0),
     ]
+
+
+class Still:
+    """Does nothing."""
+
+    def start(self, episodes, stream):
+        return np.zeros((episodes, 2))
+
+    def act(self, observations, t, state):
+        return state, state, state
+
+
+def test_what_is_held_in_memory_is_foreseen() -> None:
+    sets = ["task.observation.window=2", "task.horizon=7", "evaluation.episodes=5"]
+    [cell] = cells(load_card("nav"), "solar", [0], sets=sets)
+    evaluated = Judge(cell).evaluate(Still(), 0).episodes
+    parts = (evaluated.frames, evaluated.actions, evaluated.action_means, evaluated.costs)
+    held = sum(part.nbytes for part in parts)
+    evaluation, batch, dynamics, weights = memory_needs(cell)
+    assert evaluation.bytes == held
+    assert batch.bytes == held / 5 * 80  # the card's first batch
+    assert dynamics.bytes == np.zeros((7, 4 * 2, 4 * 2)).nbytes  # d = 4, two frames a window
+    assert weights.bytes == np.zeros((7, 7)).nbytes
+
+
+def test_frames_of_a_state_are_single_precision() -> None:
+    [image] = cells(load_card("nav"), "solar", [0])
+    vector = 'task.observation={kind="state", width=512}'  # 4 bytes an entry: 2048, as the images
+    [state] = cells(load_card("nav"), "solar", [0], sets=[vector])
+    assert memory_needs(state)[0].bytes == memory_needs(image)[0].bytes
+
+
+def test_a_large_cell_is_estimated_by_its_size(store: Store) -> None:
+    [cell] = cells(load_card("nav"), "solar", [0], sets=["evaluation.episodes=100000"])
+    [found] = estimate(store, [Plan(cell, 100, Action.RUN, "why")])
+    assert found.memory_bytes == sum(need.bytes for need in memory_needs(cell)) > WORKER_BYTES
 
 
 def test_nothing_is_known_of_another_variant(

@@ -68,6 +68,15 @@ def test_a_finished_cell_is_skipped_until_more_is_wanted(store: Store, cell: Cel
     assert decided(store, cell, redo=True)[0] is Action.REDO
 
 
+def test_one_episode_is_said_as_one(store: Store, cell: Cell) -> None:
+    past(store, cell, Outcome.FINISHED, episodes=1)
+    assert decided(store, cell, wanted=1) == (Action.SKIP, "finished with 1 episode")
+    assert decided(store, cell, redo=True) == (
+        Action.REDO,
+        "--redo discards 1 episode (finished)",
+    )
+
+
 def test_an_interrupted_cell_is_resumed(store: Store, cell: Cell) -> None:
     past(store, cell, Outcome.INTERRUPTED, episodes=8)
     action, why = decided(store, cell)

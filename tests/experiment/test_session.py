@@ -1,6 +1,8 @@
 """One attempt at one cell: whatever interrupts it, the results are those of a quiet run."""
 
 from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,7 @@ from solar_cli.experiment.judge import Judge
 from solar_cli.experiment.messages import Message
 from solar_cli.experiment.session import Session, Stopped
 from solar_cli.methods import Diverged
-from solar_cli.settings import Cell
+from solar_cli.settings import Cell, cells, load_card
 from solar_cli.store.owner import Owner
 from solar_cli.store.records import Fenced, Outcome
 from solar_cli.store.store import Store
@@ -345,18 +347,39 @@ def test_a_checkpoint_that_does_not_fit_the_code_says_what_to_do(
         attempt(store, cell)
 
 
+@pytest.mark.parametrize(("every", "kept"), [(1e9, [8, 7, 3]), (0.0, [8, 8, 3])])
 def test_two_newest_checkpoints_and_the_best_by_training_cost_are_kept(
-    store: Store, cell: Cell, monkeypatch: pytest.MonkeyPatch
+    store: Store, cell: Cell, monkeypatch: pytest.MonkeyPatch, every: float, kept: list[int]
 ) -> None:
     def best_at_four(self: Environment, iteration: int) -> dict[str, float]:
         return {"return": -abs(iteration - 4.0)}
 
     monkeypatch.setattr(Environment, "summary", best_at_four)
-    attempt(store, cell, target=32, every=1e9)
+    attempt(store, cell, target=32, every=every)
     # Iteration 4 is collected by the policy of the checkpoint of iteration 3.
     records = store.checkpoints(cell.hash)
-    assert [record.iteration for record in records] == [8, 7, 3]
+    assert [record.iteration for record in records] == kept
     assert files_of(store, cell.hash) == {store.folder(cell.hash) / r.path for r in records}
+
+
+def test_the_first_checkpoint_at_each_milestone_of_the_card_is_kept(
+    store: Store, cell: Cell
+) -> None:
+    card = load_card("nav")
+    tables = {**card.tables["evaluation"], "milestones": [4, 10, 18, 1000]}
+    marked = replace(card, tables={**card.tables, "evaluation": tables})
+    [kept] = cells(marked, "fake", [0], "smoke")
+    assert kept.hash == cell.hash  # milestones name no other cell
+    for _ in range(9):  # killed within every iteration, saved at every pulse
+        with suppress(Killed):
+            attempt(store, kept, Boss(kill_at=9), target=32)
+    attempt(store, kept, target=32)
+    best = checkpointing.best_iteration(store, kept.hash)
+    records = store.checkpoints(kept.hash)
+    # Four episodes an iteration: 4 are reached in iteration 1, 10 in 3, 18 in 5, 1000 not yet.
+    assert {r.iteration for r in records if r.complete} == {1, 3, 5, 8} | {best}
+    assert [record.episodes for record in records if record.iteration in (1, 3, 5)] == [20, 12, 4]
+    assert files_of(store, kept.hash) == {store.folder(kept.hash) / r.path for r in records}
 
 
 def test_evaluation_episodes_are_none_that_were_learned_from(store: Store, cell: Cell) -> None:

@@ -147,3 +147,18 @@ def test_conditioning_a_data_rich_joint_is_least_squares_with_an_intercept():
         np.testing.assert_allclose(F[t], solution[:3].T, atol=1e-3)
         np.testing.assert_allclose(f[t], solution[3], atol=5e-3)
         np.testing.assert_allclose(Sigma[t], residual.T @ residual / 200, rtol=1e-6)
+
+
+def test_points_of_weight_zero_are_as_if_not_there():
+    points = torch.as_tensor(clusters()[0].reshape(6, 100, 2)).clone()
+    live = torch.arange(100) < torch.tensor([100, 40, 7, 2, 1, 60])[:, None]
+    mixture = gmm.fit_mixture(points[live], 3, np.random.default_rng(7)).mixture
+    points[~live] = 1e3
+    prior = gmm.local_prior(mixture, points, live)
+    joint = gmm.fit_joint(points, prior, live)
+    for t in range(6):
+        own = points[t : t + 1, live[t]]
+        expected = gmm.local_prior(mixture, own)
+        found = [part[t : t + 1] for part in (*prior[:2], *joint)]
+        for left, right in zip(found, (*expected[:2], *gmm.fit_joint(own, expected)), strict=True):
+            torch.testing.assert_close(left, right)

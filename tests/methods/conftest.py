@@ -1,10 +1,8 @@
 """Methods are tested as a worker runs them, with pulses and cost fits that fit into a test."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import torch
 
 from solar_cli.control import quadratic_cost
 from solar_cli.models import training
@@ -19,12 +17,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(autouse=True)
-def as_in_a_worker(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    torch.use_deterministic_algorithms(True)
+def as_in_a_worker(worker_torch: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """For every test here, with short steps."""
     monkeypatch.setattr(training, "PULSE_STEPS", 4)
     monkeypatch.setattr(quadratic_cost, "LBFGS_ROUNDS", 10)
-    yield
-    torch.use_deterministic_algorithms(False)
-    torch.set_num_threads(threads)

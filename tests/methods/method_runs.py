@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
-import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
+from bits import digest, through_a_file
 
 from solar_cli.envs import build_task
 from solar_cli.episodes import Environment, Experience
@@ -57,11 +55,8 @@ class Run:
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint holds, as a file gives it back."""
-        buffer = io.BytesIO()
         parts = {"learner": self.learner.state_dict(), "environment": self.environment.state_dict()}
-        torch.save(parts, buffer)
-        buffer.seek(0)
-        state: dict[str, Any] = torch.load(buffer, weights_only=True)
+        state: dict[str, Any] = through_a_file(parts)
         return state
 
     def restore(self, state: dict[str, Any]) -> Run:
@@ -73,30 +68,6 @@ class Run:
     def bits(self) -> str:
         """SHA-256 of all state."""
         return digest(self.state())
-
-
-def digest(value: Any) -> str:
-    """SHA-256 of plain data and tensors, to the last bit."""
-    found = hashlib.sha256()
-
-    def feed(part: Any) -> None:
-        if isinstance(part, torch.Tensor):
-            found.update(f"{part.dtype}{tuple(part.shape)}".encode())
-            found.update(part.detach().contiguous().numpy().tobytes())
-        elif isinstance(part, dict):
-            for key in sorted(part, key=repr):
-                if "seconds" not in str(key):
-                    found.update(repr(key).encode())
-                    feed(part[key])
-        elif isinstance(part, list | tuple):
-            found.update(f"[{len(part)}".encode())
-            for item in part:
-                feed(item)
-        else:
-            found.update(repr(part).encode())
-
-    feed(value)
-    return found.hexdigest()
 
 
 class Costing:

@@ -7,6 +7,7 @@ from method_runs import Run
 
 from solar_cli.episodes import Experience, window_indices
 from solar_cli.methods import solar
+from solar_cli.models.representation import Representation
 
 EPISODES = "batches={ initial = 16, noisy = 16 }"
 
@@ -51,10 +52,10 @@ def test_a_changed_head_is_undone_by_line_six_alone(tmp_path, linearise, preserv
     with torch.no_grad():
         head.weight.copy_(mixing @ head.weight)
         head.bias.copy_(mixing @ head.bias + 0.1)
-    run.learner.representation.moved = True
+    run.learner.representation.moved_in = 3
     assert change(run, episodes) > 0.3
-    states = run.learner.embedded(episodes)
-    run.learner.gains = run.learner.linearised(region, states).policy
+    states, _ = run.learner.embedded(episodes, [])
+    run.learner.handed = run.learner.linearised(region, states).policy
     # The new latents are an affine map of the old ones, which a linear policy can undo.
     assert (change(run, episodes) < 0.01) == preserved
     if not preserved:
@@ -79,9 +80,9 @@ def test_fine_tuning_preserves_the_acting_policy(tmp_path, monkeypatch):
         with monkeypatch.context() as patch:
             patch.setattr(solar, "improve_policy", lambda *a: improved.append(a[0]) or improve(*a))  # noqa: B023
             run.iterate(3, 3)
-        assert run.learner.representation.moved
+        assert run.learner.representation.moved_in == 3
         episodes = run.environment.collected(run.learner.trust_region.current.iteration)
-        run.learner.gains = improved[0]
+        run.learner.handed = improved[0]
         errors[linearise] = change(run, episodes)
     # What is left is what no linear policy on the new latents does: the change is not affine.
     assert errors["true"] < 0.2
@@ -91,7 +92,31 @@ def test_fine_tuning_preserves_the_acting_policy(tmp_path, monkeypatch):
 def test_a_frozen_encoder_leaves_the_policy_as_it_is(tmp_path):
     run, region, episodes = before_the_update(tmp_path, "true")
     run.learner.representation.update(Experience(run.environment))
-    assert not run.learner.representation.moved
-    previous = run.learner.linearised(region, run.learner.embedded(episodes))
+    assert run.learner.representation.moved_in == 1
+    previous = run.learner.linearised(region, run.learner.embedded(episodes, [])[0])
     for left, right in zip(previous.policy, run.learner.gains, strict=True):
         assert torch.equal(left, right)
+
+
+def test_going_back_to_a_policy_of_older_latents_preserves_it(tmp_path, monkeypatch):
+    """The best policy acted before the last fine-tuning that held; the newest is taken back."""
+    costs = {2: -1e3, 3: 1e3}
+    run = Run(
+        tmp_path,
+        "solar",
+        "batches={ initial = 32, noisy = 32 }",
+        "training.steps=60",
+        "training.fine_tune_steps=12",
+        "training.fine_tune_rate=0.001",
+        costs=lambda iteration, cost: cost + costs.get(iteration, 0.0),
+    )
+    run.iterate(1, 2)
+    improved, improve = [], solar.improve_policy
+    monkeypatch.setattr(solar, "improve_policy", lambda *a: improved.append(a[0]) or improve(*a))
+    alive = iter([True, False])  # before the training, and after it
+    monkeypatch.setattr(Representation, "_alive", lambda *_: next(alive))
+    run.iterate(3, 3)
+    assert run.metrics[2]["rejected"] == run.metrics[2]["fine_tuning_taken_back"] == 1.0
+    assert run.learner.trust_region.current.iteration == 2
+    run.learner.gains = improved[0]
+    assert change(run, run.environment.collected(2)) < 0.2

@@ -7,9 +7,10 @@ import pytest
 import torch
 from method_runs import Run
 
+from solar_cli.control import trust_region
 from solar_cli.envs import build_task
 from solar_cli.episodes import Evaluation, Experience, evaluate
-from solar_cli.methods import Diverged, solar
+from solar_cli.methods import Diverged, local, solar
 from solar_cli.streams import Streams
 
 both = pytest.mark.parametrize("name", ["solar", "vae"])
@@ -17,14 +18,37 @@ both = pytest.mark.parametrize("name", ["solar", "vae"])
 
 def spied(monkeypatch, name):
     """Arguments of every call of a function of Algorithm 1's page."""
-    calls, function = [], getattr(solar, name)
-    monkeypatch.setattr(solar, name, lambda *given: calls.append(given) or function(*given))
+    page = local if hasattr(local, name) else solar
+    calls, function = [], getattr(page, name)
+    monkeypatch.setattr(page, name, lambda *given: calls.append(given) or function(*given))
     return calls
 
 
 def of_iteration(number, change):
     """Costs of one iteration are changed on their way to the learner."""
     return lambda iteration, costs: change(costs) if iteration == number else costs
+
+
+# Handing over
+
+
+@pytest.mark.parametrize("share", [-1.0, 1e9])
+def test_an_update_that_promises_little_is_tried_before_it_is_handed_over(
+    tmp_path, monkeypatch, share
+):
+    monkeypatch.setattr(trust_region, "LEAST_PROMISE", share)
+    calls = spied(monkeypatch, "improve_policy")
+    # Costs fall by a constant, so that something was gained.
+    run = Run(tmp_path, "solar", costs=of_iteration(2, lambda costs: costs - 10.0)).iterate(1, 2)
+    previous, newest = calls[-1][0], run.learner.gains
+    expected = newest if share < 0 else previous
+    for handed, part in zip(run.learner.policy.gains, expected, strict=True):
+        assert torch.equal(handed, part)
+    run.environment.begin(3)
+    run.learner.collect(Experience(run.environment))
+    z, _ = run.learner.embedded(run.environment.collected(3), [])
+    means = torch.einsum("tij,ntj->nti", newest.K, z.z[:, :-1]) + newest.k
+    torch.testing.assert_close(z.action_means, means)  # the newest is what is tried
 
 
 # Collecting

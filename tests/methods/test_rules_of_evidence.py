@@ -1,7 +1,8 @@
 """Rules of evidence 1: a policy comes from collected costs and frames, and from nothing else."""
 
 import pytest
-from method_runs import Run, digest
+from bits import digest
+from method_runs import Run
 
 from solar_cli.envs import build_task
 from solar_cli.episodes import evaluate

@@ -1,10 +1,6 @@
-"""Small problems for models: a task of vectors, latents of made-up episodes, digests of state."""
+"""Small problems for models: a task of vectors, latents of made-up episodes."""
 
 from __future__ import annotations
-
-import hashlib
-import io
-from typing import Any
 
 import numpy as np
 import torch
@@ -56,34 +52,3 @@ def made_up_segments(
         torch.as_tensor(rng.normal(size=(count, length - 1, actions))),
         torch.tensor(starts),
     )
-
-
-def digest(value: Any) -> str:
-    """SHA-256 of plain data and tensors, to the last bit."""
-    found = hashlib.sha256()
-
-    def feed(part: Any) -> None:
-        if isinstance(part, torch.Tensor):
-            found.update(f"{part.dtype}{tuple(part.shape)}".encode())
-            found.update(part.detach().contiguous().numpy().tobytes())
-        elif isinstance(part, dict):
-            for key in sorted(part, key=repr):
-                found.update(repr(key).encode())
-                feed(part[key])
-        elif isinstance(part, (list, tuple)):
-            found.update(f"[{len(part)}".encode())
-            for item in part:
-                feed(item)
-        else:
-            found.update(repr(part).encode())
-
-    feed(value)
-    return found.hexdigest()
-
-
-def through_a_file(state: Any) -> Any:
-    """What a checkpoint gives back."""
-    buffer = io.BytesIO()
-    torch.save(state, buffer)
-    buffer.seek(0)
-    return torch.load(buffer, weights_only=True)

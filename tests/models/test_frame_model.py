@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from solar_cli.errors import UsageError
+from solar_cli.models import frames as frames_module
 from solar_cli.models.frames import FrameModel
 from solar_cli.settings.local import Representation
 from solar_cli.settings.task import Observation
@@ -42,6 +43,15 @@ def test_standardised_images_have_one_scale_around_the_mean_image():
     expected = centred / math.sqrt(np.square(centred).mean())
     np.testing.assert_allclose(found, expected, atol=1e-5)  # float32
     assert float(found.square().mean()) == pytest.approx(1.0, rel=1e-5)
+
+
+def test_scales_of_many_frames_are_those_of_all_at_once(monkeypatch):
+    together, apart = model(), model()
+    together.standardise_by(images())
+    monkeypatch.setattr(frames_module, "CHUNK", 2)
+    apart.standardise_by(images())
+    torch.testing.assert_close(apart.frame_mean, together.frame_mean)
+    torch.testing.assert_close(apart.frame_scale, together.frame_scale)
 
 
 def test_standardised_states_have_a_scale_an_entry():

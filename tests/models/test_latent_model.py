@@ -8,7 +8,7 @@ from model_problems import vector_episodes, vector_task
 from solar_cli.models import latent_model
 from solar_cli.models.frames import FrameModel
 from solar_cli.models.latent_model import LatentModel, Minibatch
-from solar_cli.models.priors import LinearDynamics, StandardNormal
+from solar_cli.models.priors import BayesianLDS, StandardNormal
 from solar_cli.settings.local import Dynamics, Representation
 
 TASK = vector_task(horizon=5, width=3, window=2)
@@ -20,7 +20,7 @@ def tiny(prior="linear", standard_normal=0.05, **settings) -> LatentModel:
     layers = ({"kind": "linear", "width": 4, "activation": "none"},)
     table = {"latent": D, "encoder": layers, "decoder": layers, "likelihood": "gaussian"}
     networks = FrameModel(Representation.model_validate(table | settings), TASK.observation)
-    chosen = LinearDynamics(Dynamics(), D, TASK, "cpu") if prior == "linear" else StandardNormal()
+    chosen = BayesianLDS(Dynamics(), D, TASK, "cpu") if prior == "linear" else StandardNormal()
     return LatentModel(networks.double(), chosen, standard_normal)
 
 

@@ -11,7 +11,7 @@ from torch.nn import functional
 from solar_cli.errors import UsageError
 from solar_cli.models.networks import build
 from solar_cli.settings import load_card, resolve
-from solar_cli.settings.networks import FULLY_CONNECTED, KEY_POINTS, Layer
+from solar_cli.settings.networks import BUMPS, KEY_POINTS, Layer
 
 LAYERS = TypeAdapter(tuple[Layer, ...])
 
@@ -228,12 +228,12 @@ SAWYER = [
         (REACHER, (3, 64, 64)),
         (SAWYER, (5,)),
         (KEY_POINTS, (2, 32, 32)),
-        (FULLY_CONNECTED, (4,)),
+        (BUMPS, (4,)),
         ([], (4,)),
     ],
 )
 def test_the_shape_that_is_promised_is_the_shape_that_comes(layers, shape):
-    module, promised = build(LAYERS.validate_python(layers), shape)
+    module, promised = build(LAYERS.validate_python(layers), shape, (1, 8, 6))
     assert tuple(module(batch(*shape)).shape) == (3, *promised)
 
 

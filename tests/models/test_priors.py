@@ -11,8 +11,9 @@ import torch
 from model_problems import made_up_segments, vector_task
 from scipy import special, stats
 
+from solar_cli.inference import niw
 from solar_cli.models.priors import (
-    LinearDynamics,
+    BayesianLDS,
     Segments,
     StandardNormal,
     regressors,
@@ -34,7 +35,7 @@ every_form = pytest.mark.parametrize(
 
 def dynamics(factors="shared", rows="newest", window=1, **settings):
     task = vector_task(horizon=T, window=window, actions=a)
-    return LinearDynamics(Dynamics(factors=factors, rows=rows, **settings), d, task, "cpu")
+    return BayesianLDS(Dynamics(factors=factors, rows=rows, **settings), d, task, "cpu")
 
 
 def whole_episodes(seed=0, count=5):
@@ -43,7 +44,7 @@ def whole_episodes(seed=0, count=5):
 
 def transitions(segments, window, rows):
     """(segment, t, x, var x, y, var y) of every z_t -> z_{t+1} inside the segments."""
-    mean, variance, actions, start = (part.numpy() for part in segments)
+    mean, variance, actions, start = (part.numpy() for part in segments[:4])
     found = []
     for s in range(len(start)):
         for newest in range(window - 1, mean.shape[1] - 1):
@@ -104,23 +105,35 @@ def initial_belief(segments, entries=d):
     return A - B @ B.T / C, nu, B / C, 1 / C
 
 
+def reach(length, window):
+    """How many of the starts that a segment can have reach each time step; and their number."""
+    starts = range(T + 2 - length)
+    reached = [t for s in starts for t in range(s + window - 1, s + length - 1)]
+    return [reached.count(t) for t in range(T)], len(starts)
+
+
 def expected_total(prior_settings, learned_from, judged, window):
     """KL a frame of ``judged`` under factors that were conditioned on ``learned_from``."""
     rows = prior_settings.rows
     entries, size = d if rows == "newest" else window * d, window * d + a + 1
     data = transitions(learned_from, window, rows)
     initial = initial_belief(learned_from)
-    terms = []
+    reached, starts = reach(judged.mean.shape[1], window)
+    total = 0.0
     for _, t, *sample in transitions(judged, window, rows):
         same = [s for _, u, *s in data if prior_settings.factors == "shared" or u == t]
         belief = bayesian_regression(same, entries, size, prior_settings)
-        terms.append(expected_kl(belief, *sample))
+        total += starts / reached[t] * expected_kl(belief, *sample)
     one, zero = np.ones(1), np.zeros(1)
     for s in range(len(judged.start)):
         if judged.start[s] == 0:
             y, variance = judged.mean[s, 0].numpy(), judged.variance[s, 0].numpy()
-            terms.append(expected_kl(initial, one, zero, y, variance))
-    return sum(terms) / len(terms)
+            total += starts * expected_kl(initial, one, zero, y, variance)
+    return total / len(judged.start) / (T + 2 - window)
+
+
+def kl(prior, segments):
+    return prior.kl(prior.statistics(segments))
 
 
 # The KL terms of the ELBO
@@ -133,7 +146,7 @@ def test_kl_is_that_of_a_dense_loop(factors, rows, window):
     prior.conclude(learned)
     judged = made_up_segments(2, [0, 1, 0], T, d, a)
     expected = expected_total(prior.settings, learned, judged, window)
-    assert float(prior.kl(judged)) == pytest.approx(expected, rel=1e-9)
+    assert float(kl(prior, judged)) == pytest.approx(expected, rel=1e-9)
 
 
 def test_segments_inside_an_episode_have_no_initial_term():
@@ -141,7 +154,33 @@ def test_segments_inside_an_episode_have_no_initial_term():
     prior.conclude(whole_episodes(1))
     judged = made_up_segments(2, [1, 2], 4, d, a)
     expected = expected_total(prior.settings, whole_episodes(1), judged, 1)
-    assert float(prior.kl(judged)) == pytest.approx(expected, rel=1e-9)
+    assert float(kl(prior, judged)) == pytest.approx(expected, rel=1e-9)
+
+
+@every_form
+@pytest.mark.parametrize("length", [4, 5, 7])
+def test_segments_of_every_start_are_on_average_whole_episodes(factors, rows, window, length):
+    prior, episodes = dynamics(factors, rows, window), whole_episodes(6)
+    prior.conclude(whole_episodes(1))
+    parts = []
+    for start in range(T + 2 - length):
+        frames, moves = slice(start, start + length), slice(start, start + length - 1)
+        parts.append(
+            Segments(
+                episodes.mean[:, frames],
+                episodes.variance[:, frames],
+                episodes.actions[:, moves],
+                episodes.start + start,
+            )
+        )
+    found = [prior.statistics(part) for part in parts]
+    whole = prior.statistics(episodes)
+    for name in ("transitions", "starts"):
+        for index, expected in enumerate(getattr(whole, name)):
+            mean = sum(getattr(part, name)[index] for part in found) / len(parts)
+            torch.testing.assert_close(mean, expected, rtol=1e-12, atol=1e-12)
+    mean = sum(float(prior.kl(part)) for part in found) / len(parts)
+    assert mean == pytest.approx(float(prior.kl(whole)), rel=1e-12)
 
 
 def test_kl_is_a_mean_over_draws_of_dynamics_and_latents():
@@ -157,19 +196,20 @@ def test_kl_is_a_mean_over_draws_of_dynamics_and_latents():
     F = M + np.linalg.cholesky(Sigma) @ white @ np.linalg.cholesky(V).T
     Sigma0 = stats.invwishart(nu0, Psi0).rvs(n, random_state=rng)
     centre = np.linalg.cholesky(Sigma0 * V0) @ rng.normal(size=(n, d, 1)) + mu0
-    draws = _gaussian_kl(segments.mean[0, 0], segments.variance[0, 0], centre[..., 0], Sigma0)
+    # Of the five starts of a segment of three frames one reaches t = 0, and two reach t = 1.
+    draws = 5 * _gaussian_kl(segments.mean[0, 0], segments.variance[0, 0], centre[..., 0], Sigma0)
     for t in range(2):
         mean, variance = segments.mean[0, t].numpy(), segments.variance[0, t].numpy()
         z = mean + np.sqrt(variance) * rng.normal(size=(n, d))
         x = np.concatenate([z, np.tile([*segments.actions[0, t], 1.0], (n, 1))], axis=1)
         predicted = np.einsum("nij,nj->ni", F, x)
-        draws = draws + _gaussian_kl(
+        draws = draws + 5 / (t + 1) * _gaussian_kl(
             segments.mean[0, t + 1], segments.variance[0, t + 1], predicted, Sigma
         )
-    draws = draws / 3
+    draws = draws / (T + 1)
     error = draws.std() / math.sqrt(n)
     assert error < 0.02
-    assert abs(draws.mean() - float(prior.kl(segments))) < 5 * error
+    assert abs(draws.mean() - float(kl(prior, segments))) < 5 * error
 
 
 def _gaussian_kl(mean, variance, centres, covariances):
@@ -191,11 +231,11 @@ def test_gradients_are_those_of_finite_differences(factors, rows, window):
     prior.conclude(whole_episodes(1))
     judged = made_up_segments(2, [0, 1], window + 2, d, a)
 
-    def kl(mean, log_variance):
-        return prior.kl(judged._replace(mean=mean, variance=log_variance.exp()))
+    def total(mean, log_variance):
+        return kl(prior, judged._replace(mean=mean, variance=log_variance.exp()))
 
     inputs = judged.mean.clone().requires_grad_(), judged.variance.log().requires_grad_()
-    assert torch.autograd.gradcheck(kl, inputs)
+    assert torch.autograd.gradcheck(total, inputs)
 
 
 def test_latents_that_follow_the_dynamics_cost_less_than_others():
@@ -214,7 +254,7 @@ def test_latents_that_follow_the_dynamics_cost_less_than_others():
     )
     prior.conclude(segments)
     shuffled = segments._replace(actions=segments.actions.flip(0))
-    assert float(prior.kl(segments)) < float(prior.kl(shuffled)) - 1.0
+    assert float(kl(prior, segments)) < float(kl(prior, shuffled)) - 1.0
 
 
 # Learning the factors
@@ -225,8 +265,10 @@ def test_a_full_step_on_all_data_is_the_closed_form(factors, rows, window):
     closed, stepped = (dynamics(factors, rows, window, rate=1.0) for _ in range(2))
     segments = whole_episodes(1)
     closed.conclude(segments)
-    stepped.learn(whole_episodes(7), (3.0, 2.0))  # a full step forgets where it came from
-    stepped.learn(segments, (1.0, 1.0))
+    stepped.learn(
+        stepped.statistics(whole_episodes(7)), 3.0
+    )  # a full step forgets where it came from
+    stepped.learn(stepped.statistics(segments), 1.0)
     for left, right in zip(
         (*stepped.factor, *stepped.initial), (*closed.factor, *closed.initial), strict=True
     ):
@@ -247,7 +289,7 @@ def test_what_is_given_episodes_alone_forgets_all_others(factors, rows, window):
 
 def test_without_the_closed_form_a_training_ends_with_one_more_step():
     stepped, ended = (dynamics(closed_form=False, rate=0.3) for _ in range(2))
-    stepped.learn(whole_episodes(1), (1.0, 1.0))
+    stepped.learn(stepped.statistics(whole_episodes(1)), 1.0)
     ended.conclude(whole_episodes(1))
     for left, right in zip(
         (*stepped.factor, *stepped.initial), (*ended.factor, *ended.initial), strict=True
@@ -261,21 +303,20 @@ def test_steps_of_a_small_rate_close_the_gap_geometrically():
     segments = whole_episodes(1)
     closed.conclude(segments)
     for _ in range(steps):
-        stepped.learn(segments, (1.0, 1.0))
+        stepped.learn(stepped.statistics(segments), 1.0)
     for now, target, start in zip(stepped.factor, closed.factor, stepped.prior, strict=True):
         expected = target + (1 - rate) ** steps * (start - target)
         torch.testing.assert_close(now, expected, rtol=1e-10, atol=1e-10)
 
 
-def test_weights_count_transitions_and_starts():
+def test_the_scale_counts_episodes():
     stepped, many = dynamics(rate=1.0), dynamics()
     segments = whole_episodes(1)
-    stepped.learn(segments, (3.0, 2.0))
-    many.conclude(Segments(*(torch.cat([part] * 3) for part in segments)))
-    for left, right in zip(stepped.factor, many.factor, strict=True):
-        torch.testing.assert_close(left, right, rtol=1e-12, atol=1e-12)
-    many.conclude(Segments(*(torch.cat([part] * 2) for part in segments)))
-    for left, right in zip(stepped.initial, many.initial, strict=True):
+    stepped.learn(stepped.statistics(segments), 3.0)
+    many.conclude(Segments(*(torch.cat([part] * 3) for part in segments[:4])))
+    for left, right in zip(
+        (*stepped.factor, *stepped.initial), (*many.factor, *many.initial), strict=True
+    ):
         torch.testing.assert_close(left, right, rtol=1e-12, atol=1e-12)
 
 
@@ -301,13 +342,12 @@ def test_factors_are_bayesian_regressions(factors, rows, window):
 
 
 def test_the_initial_factor_is_learned_from_starts_of_episodes():
-    prior = dynamics()
-    segments = made_up_segments(8, [0, 2, 0, 1], 4, d, a)
+    prior, segments = dynamics(), whole_episodes(8)
     prior.conclude(segments)
     Psi, nu, mu, inverse_kappa = initial_belief(segments)
     found = prior.initial
     np.testing.assert_allclose(found.n, nu)
-    assert nu == d + 2 + 2
+    assert nu == d + 2 + 5
     np.testing.assert_allclose(found.xx, 1 / inverse_kappa)
     np.testing.assert_allclose(found.yx / found.xx, mu, rtol=1e-12)
     np.testing.assert_allclose(found.yy - found.yx @ found.yx.mT / found.xx, Psi, rtol=1e-12)
@@ -341,10 +381,10 @@ def test_windows_have_the_newest_frame_first():
 @every_form
 def test_a_prior_survives_its_state(factors, rows, window):
     prior, fresh = (dynamics(factors, rows, window) for _ in range(2))
-    prior.learn(whole_episodes(1), (2.0, 1.0))
+    prior.learn(prior.statistics(whole_episodes(1)), 2.0)
     fresh.load_state_dict(prior.state_dict())
     judged = whole_episodes(3)
-    assert float(fresh.kl(judged)) == float(prior.kl(judged))
+    assert float(kl(fresh, judged)) == float(kl(prior, judged))
     assert fresh.metrics() == prior.metrics()
 
 
@@ -357,6 +397,22 @@ def test_before_any_data_the_factors_are_the_prior():
     assert prior.metrics()["kl_initial"] > 0.1
 
 
+@every_form
+def test_a_latent_that_never_changes_breaks_neither_factor(factors, rows, window):
+    segments = whole_episodes(1, count=40)
+    segments.mean[..., 1] = 3.0
+    segments.variance[..., 1] = 1e-7
+    segments.mean.requires_grad_()
+    prior = dynamics(factors, rows, window)
+    prior.conclude(segments)
+    total = kl(prior, segments)
+    (gradient,) = torch.autograd.grad(total, segments.mean)
+    assert torch.isfinite(gradient).all()
+    assert all(math.isfinite(value) for value in (total.item(), *prior.metrics().values()))
+    # Its start is known: the prior's one sample at 0 counts beside the 40 at 3.
+    assert float(niw.standard(prior.initial).mu0[1]) == pytest.approx(3.0 * 40 / 41)
+
+
 # The VAE's
 
 
@@ -366,15 +422,15 @@ def test_the_standard_normal_is_torch_distributions():
     normal = torch.distributions.Normal(torch.zeros(()).double(), torch.ones(()).double())
     expected = torch.distributions.kl_divergence(factor, normal).sum(dim=-1)
     torch.testing.assert_close(standard_normal_kl(segments.mean, segments.variance), expected)
-    torch.testing.assert_close(StandardNormal().kl(segments), expected.mean())
+    torch.testing.assert_close(kl(StandardNormal(), segments), expected.mean())
 
 
 def test_the_standard_normal_knows_no_dynamics():
     prior, segments = StandardNormal(), whole_episodes(1)
-    before = float(prior.kl(segments))
-    prior.learn(segments, (1.0, 1.0))
+    before = float(kl(prior, segments))
+    prior.learn(prior.statistics(segments), 1.0)
     prior.conclude(segments)
     assert prior.factor is None
     assert prior.given(segments) is None
-    assert float(prior.kl(segments)) == before
+    assert float(kl(prior, segments)) == before
     assert prior.state_dict() == prior.metrics() == {}

@@ -6,12 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from model_problems import digest, through_a_file, vector_episodes, vector_task
+from bits import digest, through_a_file
+from model_problems import vector_episodes, vector_task
 
 from solar_cli.episodes import Episodes, window_indices
 from solar_cli.errors import UsageError
 from solar_cli.models import representation, training
-from solar_cli.models.priors import LinearDynamics
+from solar_cli.models.priors import BayesianLDS
 from solar_cli.models.representation import Representation
 from solar_cli.settings.local import Solar
 from solar_cli.streams import Streams
@@ -70,7 +71,7 @@ def make(score=None, pulse=lambda *_: None, seed=0, task=TASK, **changes) -> Rep
     return Representation(
         settings,
         task,
-        lambda: LinearDynamics(settings.dynamics, 2, task, "cpu"),
+        lambda: BayesianLDS(settings.dynamics, 2, task, "cpu"),
         Scores(1.0) if score is None else score,
         Streams(seed),
         "cpu",
@@ -239,19 +240,10 @@ def checkpoints(batches: list[Collected], **changes) -> tuple[list[Any], str, li
     metrics: list[dict[str, float]] = []
     for batch in batches:
         metrics.append(model.update(batch))
-    return saved, timeless(model.state_dict()), metrics
+    return saved, digest(model.state_dict()), metrics
 
 
 SCORES = (0.1, 0.2, 0.9)
-
-
-def timeless(state: Any) -> str:
-    """The digest of a state without the seconds that were spent on it."""
-    if isinstance(state, dict):
-        return digest(
-            {name: timeless(part) for name, part in state.items() if "seconds" not in str(name)}
-        )
-    return digest([timeless(part) for part in state] if isinstance(state, list | tuple) else state)
 
 
 def without_seconds(metrics: dict[str, float]) -> dict[str, float]:
@@ -280,7 +272,7 @@ def test_an_update_stopped_at_any_pulse_goes_on_with_the_same_bits(
         resumed.load_state_dict(state)
         for batch, before in list(zip(batches, metrics, strict=True))[number:]:
             assert without_seconds(resumed.update(batch)) == without_seconds(before)
-        assert timeless(resumed.state_dict()) == expected
+        assert digest(resumed.state_dict()) == expected
 
 
 @pytest.mark.parametrize("fine_tune_steps", [0, 4])
@@ -297,7 +289,7 @@ def test_a_checkpoint_can_be_made_again_before_anything_goes_on(fine_tune_steps)
 
 def conditioned(model: Representation, *batches: Episodes) -> list[torch.Tensor]:
     """The factor of a fresh prior after the closed form on these batches."""
-    closed = LinearDynamics(model.settings.dynamics, 2, TASK, "cpu")
+    closed = BayesianLDS(model.settings.dynamics, 2, TASK, "cpu")
     closed.conclude(model._model.posterior(Episodes.joined(list(batches)), "cpu"))
     return list(closed.factor)
 
@@ -310,11 +302,11 @@ def test_a_frozen_encoder_keeps_its_states_and_learns_its_dynamics():
     model = make(buffer=2)
     batches = [FIRST, *(vector_episodes(TASK, 5, seed=seed) for seed in (1, 2))]
     model.update(Collected(batches[0]))
-    assert model.moved
+    assert model.moved_in == 1
     states, basis, factor = model.embed(FIRST), model.basis, own_factor(model)
     for last in (2, 3):
         model.update(Collected(*batches[:last]))
-        assert not model.moved
+        assert model.moved_in == 1
     assert torch.equal(model.embed(FIRST), states)
     assert digest(list(model.basis)) == digest(list(basis))
     assert digest(own_factor(model)) == digest(conditioned(model, *batches[1:]))
@@ -339,7 +331,7 @@ def test_fine_tuning_moves_the_states_within_a_fixed_basis():
     model.update(Collected(FIRST))
     states, basis = model.embed(FIRST), model.basis
     metrics = model.update(Collected(FIRST, vector_episodes(TASK, 6, seed=7)))
-    assert model.moved
+    assert model.moved_in == 2
     assert metrics["fine_tuning_taken_back"] == 0.0
     assert not torch.allclose(model.embed(FIRST), states)
     assert digest(list(model.basis)) == digest(list(basis))
@@ -364,10 +356,24 @@ def test_fine_tuning_that_kills_is_taken_back(monkeypatch):
     before = digest(model.state_dict()["parameters"]["networks"])
     answers = iter([True, False])
     monkeypatch.setattr(Representation, "_alive", staticmethod(lambda _: next(answers)))
-    metrics = model.update(Collected(FIRST, vector_episodes(TASK, 6, seed=7)))
+    second = vector_episodes(TASK, 6, seed=7)
+    metrics = model.update(Collected(FIRST, second))
     assert metrics["fine_tuning_taken_back"] == 1.0
-    assert not model.moved
+    assert model.moved_in == 1
     assert digest(model.state_dict()["parameters"]["networks"]) == before
+    # What the newest episodes say of the dynamics is not taken back.
+    assert digest(own_factor(model)) == digest(conditioned(model, FIRST, second))
+
+
+def test_judging_decodes_a_bounded_number_of_frames(monkeypatch):
+    model, decoded = make(), []
+    model.update(Collected(FIRST))
+    monkeypatch.setattr(representation, "JUDGED_FRAMES", 20)
+    decoder = model._model.networks.decoder
+    decoder.register_forward_hook(lambda _, given, __: decoded.append(len(given[0])))
+    metrics = model.update(Collected(FIRST, vector_episodes(TASK, 6, seed=7)))
+    assert 10 < max(decoded) <= 20 < 6 * (TASK.horizon + 1)
+    assert math.isfinite(metrics["held_out_elbo"])
 
 
 def test_what_was_dead_before_fine_tuning_is_tuned_all_the_same(monkeypatch):
@@ -376,7 +382,7 @@ def test_what_was_dead_before_fine_tuning_is_tuned_all_the_same(monkeypatch):
     monkeypatch.setattr(Representation, "_alive", staticmethod(lambda _: False))
     metrics = model.update(Collected(FIRST, vector_episodes(TASK, 6, seed=7)))
     assert metrics["fine_tuning_taken_back"] == 0.0
-    assert model.moved
+    assert model.moved_in == 2
 
 
 def test_metrics_of_an_update_are_finite_numbers():

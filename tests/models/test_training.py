@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from model_problems import digest, through_a_file, vector_episodes, vector_task
+from bits import digest, through_a_file
+from model_problems import vector_episodes, vector_task
 
 from solar_cli.episodes import Episodes
 from solar_cli.methods import Diverged
 from solar_cli.models import training
 from solar_cli.models.frames import FrameModel
 from solar_cli.models.latent_model import LatentModel
-from solar_cli.models.priors import LinearDynamics, StandardNormal
+from solar_cli.models.priors import BayesianLDS, StandardNormal
 from solar_cli.models.training import Dataset, Trainer
 from solar_cli.settings.local import Dynamics, Representation, Training
 from solar_cli.streams import Streams
@@ -34,7 +35,7 @@ def untrained(prior="linear", task=TASK) -> LatentModel:
     layers = ({"kind": "linear", "width": 6},)
     settings = Representation.model_validate({"latent": 2, "encoder": layers, "decoder": layers})
     networks = FrameModel(settings, task.observation)
-    chosen = LinearDynamics(Dynamics(), 2, task, "cpu") if prior == "linear" else StandardNormal()
+    chosen = BayesianLDS(Dynamics(), 2, task, "cpu") if prior == "linear" else StandardNormal()
     return LatentModel(networks, chosen, 0.05)
 
 
@@ -217,7 +218,7 @@ def test_a_share_of_the_frames_is_decoded_each_once(share, count):
 
 def test_half_of_the_segments_of_fine_tuning_are_new():
     data = Dataset([labelled(20), labelled(4)], "cpu")
-    data.frames[20:, :, 0] += 100  # the newest batch says so
+    data.frames.unflatten(0, (24, -1))[20:, :, 0] += 100  # the newest batch says so
     new = [
         int((draw(data, step, favour_newest=True, segments=10).frames[:, 0, 0] >= 100).sum())
         for step in range(40)
@@ -232,24 +233,21 @@ def test_segments_are_no_longer_than_episodes():
 
 
 @pytest.mark.parametrize("window", [1, 3])
-def test_weights_make_a_minibatch_as_large_as_the_data(window):
-    """Averaged over all segments that can be drawn, for the statistics of a shared factor."""
+def test_the_scale_makes_a_minibatch_as_large_as_the_data(window):
+    """Averaged over all segments that can be drawn."""
     task = vector_task(horizon=8, window=window)
-    data = Dataset([vector_episodes(task, 3)], "cpu")
+    data = Dataset([vector_episodes(task, 6)], "cpu")
     model = untrained(task=task)
-    prior = model.prior
     length, transitions, starts = 5, 0.0, 0.0
     firsts = 8 + 1 - length + 1
     for start in range(firsts):
         batch = draw(data, length=length)._replace(start=torch.full((3,), start))
-        segments = model.loss(batch, 1.0)[1]
-        weights = data.weights(batch)
-        transition, initial = prior._statistics(segments)
-        transitions += weights[0] * float(transition.n) / firsts
-        starts += weights[1] * float(initial.n) / firsts
-    whole, first = prior._statistics(data.posterior(model))
-    assert starts == pytest.approx(float(first.n)) == 3
-    assert transitions == pytest.approx(float(whole.n))
+        found = model.loss(batch, 1.0)[1]
+        transitions += data.scale(batch) * float(found.transitions.n) / firsts
+        starts += data.scale(batch) * float(found.starts.n) / firsts
+    whole = model.prior.statistics(data.posterior(model))
+    assert starts == pytest.approx(float(whole.starts.n)) == 6
+    assert transitions == pytest.approx(float(whole.transitions.n)) == 6 * (9 - window)
 
 
 # What a step weighs

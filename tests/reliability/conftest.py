@@ -1,13 +1,9 @@
 """Matrices to disturb, and what they have to end with."""
 
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "experiment"))  # where `bits` is
-
 from disturbed import PATIENCE, Matrix, Undisturbed
 
 from solar_cli.store.store import Store

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from stored_cells import store_attempt
 
 from solar_cli.reporting.curves import Curve, Problem, SeedCurve, seed_curve
 from solar_cli.settings import Cell, EvaluationSettings, cells, load_card
@@ -90,26 +91,14 @@ def compute(
     ``train`` has further measures, a value for each iteration from 1 on. Returns the number of the
     attempt, which goes on where ``outcome`` is None.
     """
-    store.add([of])
-    attempt = store.claim(of.hash, Owner.current(), 100, provenance)
     headline = of.configuration.evaluation.headline
+    iterations = []
     for iteration, distance in enumerate(distances):
         metrics = [Metric(headline, distance, "noise_free", np.full(4, distance))]
         for name, values in (train or {}).items():
             metrics += [Metric(name, value) for value in values[:iteration][iteration - 1 :]]
-        store.commit(
-            of.hash,
-            attempt,
-            iteration=iteration,
-            episodes=10 * iteration,
-            steps=500 * iteration,
-            simulated_seconds=500.0 * iteration,
-            seconds=2.0 * iteration,
-            metrics=metrics,
-        )
-    if outcome is not None:
-        store.end(of.hash, attempt, outcome, error)
-    return attempt
+        iterations.append(metrics)
+    return store_attempt(store, of, iterations, outcome, provenance, error)
 
 
 def add_pictures(store: Store, of: Cell, attempt: int) -> None:

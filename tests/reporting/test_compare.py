@@ -91,6 +91,15 @@ def test_exports_say_the_same_and_json_is_strict(tmp_path):
     assert r"worse (p = 0.029) \\" in found.to_latex()
 
 
+def test_a_single_seed_has_no_std_in_json(tmp_path):
+    with database(tmp_path) as store:
+        compute(store, cell("solar"), [1.0, 0.1])
+        for seed in range(2):
+            compute(store, cell("vae", seed), [1.0, 0.2])
+        (entry,) = json.loads(compare(store).to_json(), parse_constant=pytest.fail)
+    assert (entry["left"]["std"], entry["right"]["std"]) == (0.0, None)
+
+
 def test_names_that_nothing_is_stored_of_are_refused_with_the_nearest(tmp_path):
     with database(tmp_path) as store:
         compute(store, cell("solar"), [1.0, 0.1])

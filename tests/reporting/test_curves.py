@@ -69,10 +69,11 @@ def test_a_cell_without_a_finite_value_has_no_curve():
     assert seed_curve(record(cell()), [], HIGHER) is None
 
 
-def test_std_over_seeds_is_the_sample_one_and_zero_for_a_single_seed():
+def test_std_over_seeds_is_the_sample_one_and_none_for_a_single_seed():
     three = curve(*(seed(i, [(0, value)]) for i, value in enumerate([1.0, 2.0, 3.0])))
     assert three.std.tolist() == [1.0]  # sqrt((1 + 0 + 1) / 2)
-    assert curve(seed(0, [(0, 1.0)])).std.tolist() == [0.0]
+    alone = curve(seed(0, [(0, 1.0)]))
+    assert (three.final_std, alone.std, alone.final_std) == (1.0, None, None)
 
 
 def test_a_level_is_reached_at_the_first_evaluation_that_is_at_least_as_good():

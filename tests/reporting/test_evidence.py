@@ -21,8 +21,8 @@ def test_a_clean_finished_curve_of_the_present_code_needs_no_note():
 def test_seeds_of_different_commits_are_labelled():
     mixed = curve(seed(0, POINTS), seed(1, POINTS, provenance=OTHER_CODE))
     different, stale = notes(None, mixed, CODE)
-    assert "different code in one curve: aaaaaaa (seeds 0); bbbbbbb (seeds 1)" in different
-    assert "stale: seeds 1 were not computed by aaaaaaa" in stale
+    assert "different code in one curve: aaaaaaa (seed 0); bbbbbbb (seed 1)" in different
+    assert "stale: aaaaaaa did not compute seed 1" in stale
 
 
 def test_uncommitted_changes_are_labelled():

@@ -5,7 +5,7 @@ from hand_made import cell, compute, database
 
 from solar_cli.reporting.curves import problems
 from solar_cli.reporting.statistics import Interval
-from solar_cli.reporting.summary import caveats, line, summarise, table
+from solar_cli.reporting.summary import caveats, flat, line, summarise, table
 
 
 @pytest.mark.parametrize(("seeds", "shown"), [(1, "0.5 ± –"), (2, "0.5 ± 0")])
@@ -15,6 +15,7 @@ def test_a_single_seed_has_no_spread(tmp_path, seeds, shown):
             compute(store, cell(seed=seed), [1.0, 0.5])
         (problem,) = problems(store)
         summary = summarise(store, problem.curves[0], {}, {})
+    assert flat(problem, summary)["std"] == (None if seeds == 1 else 0.0)
     made = table(problem, [summary])
     assert made.rows[0][3] == shown
     assert f"final_distance {shown} " in line(problem, summary)

@@ -27,7 +27,10 @@ def test_seeds_are_a_number_a_list_or_a_range(text: str, seeds: list[int]) -> No
 
 @pytest.mark.parametrize(
     "text",
-    ["0", "-1", "", "x", "1.5", "5:5", "6:5", "1:2:3", "-2:2", "1,1", ",", "1,-1", "99999999999"],
+    [
+        *("0", "-1", "", "x", "1.5", "5:5", "6:5", "1:2:3", "-2:2", "99999999999"),
+        *("1,1", ",", "1,-1", "1,,2", ",1", "1,,", "1, ,2"),
+    ],
 )
 def test_what_is_no_seed_is_refused_with_the_forms(text: str) -> None:
     with pytest.raises(UsageError, match=r"--seeds.*expected"):

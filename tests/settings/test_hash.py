@@ -58,6 +58,7 @@ def test_an_added_setting_with_another_behaviour_changes_the_hash() -> None:
         'evaluation.better="higher"',
         'evaluation.unit="m"',
         "evaluation.levels=[1.0]",
+        "evaluation.milestones=[100, 240]",
         "methods.solar.budget.desk=7",
         "methods.solar.budget.full=70000",
     ],

@@ -205,24 +205,23 @@ def test_a_locked_database_is_one_clear_line(
         assert len(store.cells()) == 1
 
 
+def pragma(store: Store, text: str) -> int:
+    """The value of a setting of SQLite, as the store's own connection has it."""
+    with store._database._engine.connect() as connection:
+        return int(connection.exec_driver_sql(f"PRAGMA {text}").scalar_one())
+
+
 def test_a_full_disk_loses_nothing_and_work_goes_on_once_there_is_room(
     sqlite_store: Store, make_cells: MakeCells
 ) -> None:
     store = sqlite_store
     store.add(make_cells(0))
-    with store._database._engine.connect() as connection:
-        driver = connection.connection.driver_connection
-        assert driver is not None
-        (pages,) = driver.execute("PRAGMA page_count").fetchone()
-        driver.execute(f"PRAGMA max_page_count = {pages}")
+    pragma(store, f"max_page_count = {pragma(store, 'page_count')}")
     with pytest.raises(SolarError, match="disk is full"):
         store.add(make_cells(*range(1, 100)))
     assert len(store.cells()) == 1
     assert store.diagnose()["integrity"] == "ok"
-    with store._database._engine.connect() as connection:
-        driver = connection.connection.driver_connection
-        assert driver is not None
-        driver.execute("PRAGMA max_page_count = 100000")
+    pragma(store, "max_page_count = 100000")
     store.add(make_cells(*range(1, 100)))
     assert len(store.cells()) == 100
 
@@ -265,11 +264,9 @@ def test_a_mistake_of_ours_is_not_explained_away() -> None:
 
 
 def test_listing_cells_imports_nothing_heavy(
-    tmp_path: Path, make_cells: MakeCells, environment: dict[str, str]
+    sqlite_store: Store, make_cells: MakeCells, environment: dict[str, str]
 ) -> None:
-    path = tmp_path / "solar.db"
-    with Store.open(str(path)) as store:
-        store.add(make_cells(0))
+    sqlite_store.add(make_cells(0))
     script = (
         "import sys; from solar_cli.store.store import Store\n"
         "with Store.open(sys.argv[1], read_only=True) as store: assert len(store.cells()) == 1\n"
@@ -277,7 +274,7 @@ def test_listing_cells_imports_nothing_heavy(
         "print(*sorted(heavy & set(sys.modules)))"
     )
     run = subprocess.run(
-        [sys.executable, "-c", script, str(path)],
+        [sys.executable, "-c", script, sqlite_store.address],
         env=environment,
         capture_output=True,
         text=True,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from solar_cli.episodes import Environment, Episodes, Evaluation
+from solar_cli.episodes import Episodes, Evaluation, Experience
 from solar_cli.methods import Pulse
 from solar_cli.settings import MethodEntry, TaskSettings
 from solar_cli.settings.local import Budget
@@ -82,13 +82,13 @@ class RandomSearch:
         """The policy that it would hand over now."""
         return LinearPolicy(self.gains[None])
 
-    def iterate(self, environment: Environment) -> dict[str, float]:
+    def iterate(self, experience: Experience) -> dict[str, float]:
         """Try a population, one episode each; costs count by their rank, so no scale matters."""
         self.pulse("trying changes", 0.0)
-        stream = self.streams.generator("changes", environment.iteration)
+        stream = self.streams.generator("changes", experience.iteration)
         changes = stream.standard_normal((self.settings.population, *self.gains.shape))
         tried = LinearPolicy(self.gains + self.settings.spread * changes)
-        episodes = environment.collect(tried, len(changes))
+        episodes = experience.collect(tried, len(changes))
         ranks = episodes.costs.sum(axis=1).argsort().argsort()
         score = (ranks - ranks.mean()) / ranks.std()
         step = np.einsum("n,nak->ak", score, changes) / len(changes)

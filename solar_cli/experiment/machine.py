@@ -1,9 +1,7 @@
-"""What ``solar doctor`` looks at: each check says what it found and, where bad, what to do."""
+"""Whether this machine has what a run needs: each check says what it found, and what to do."""
 
 from __future__ import annotations
 
-import ctypes
-import ctypes.util
 import os
 import platform
 import shutil
@@ -15,7 +13,11 @@ from enum import StrEnum
 from importlib.metadata import version
 from pathlib import Path
 
-from solar_cli.errors import SolarError
+from solar_cli.errors import SolarError, UsageError
+from solar_cli.experiment.provenance import cores, package_versions
+from solar_cli.store.address import locate
+from solar_cli.store.database import file_system
+from solar_cli.store.store import Store
 
 LEAST_FREE = 2 * 2**30
 """Bytes of free disk from which there is a warning: some ten cells at their largest."""
@@ -52,8 +54,6 @@ def checks(address: str | None) -> Iterator[Check]:
 
 def packages() -> Iterator[Check]:
     """Versions of Solar and of what it stands on."""
-    from solar_cli.experiment.provenance import package_versions
-
     yield Check("Solar", version("solar-cli"))
     found = package_versions()
     yield Check("packages", ", ".join(f"{name} {number}" for name, number in found.items()))
@@ -61,8 +61,6 @@ def packages() -> Iterator[Check]:
 
 def torch_build() -> Check:
     """The devices that torch sees, and its threads."""
-    from solar_cli.experiment.provenance import cores
-
     try:
         import torch
     except Exception as error:  # a broken build fails in many ways, and none may hide the rest
@@ -76,9 +74,6 @@ def torch_build() -> Check:
 
 def store(address: str | None) -> Iterator[Check]:
     """The database, and the folder of the cells' files."""
-    from solar_cli.store.address import locate
-    from solar_cli.store.store import Store
-
     try:
         location = locate(address)
         if isinstance(location.place, Path) and not location.place.exists():
@@ -104,8 +99,6 @@ def judged(name: str, found: str) -> Check:
 
 def folder(home: Path) -> Iterator[Check]:
     """Permission, file system and space where ``home`` is, or will be."""
-    from solar_cli.store.database import file_system
-
     there = next(path for path in (home, *home.absolute().parents) if path.is_dir())
     try:
         with tempfile.TemporaryFile(dir=there):
@@ -128,24 +121,12 @@ def folder(home: Path) -> Iterator[Check]:
 
 
 def gl() -> Check:
-    """The libraries that MuJoCo can draw images with; only tasks in pixels of MuJoCo need one."""
-    usable = [name for name in ("EGL", "OSMesa") if _loads(name)]
-    if os.environ.get("DISPLAY") and _loads("GL"):
-        usable.append("GLX")
-    chosen = os.environ.get("MUJOCO_GL", "not set")
-    if usable:
-        return Check("GL", f"{', '.join(usable)} can be loaded; MUJOCO_GL is {chosen}")
-    return Check(
-        "GL",
-        f"neither EGL, OSMesa nor a display; MUJOCO_GL is {chosen}",
-        Verdict.DOUBTFUL,
-        "for MuJoCo tasks in pixels install libegl1 or libosmesa6",
-    )
+    """Whether MuJoCo draws; only tasks in pixels of MuJoCo need it to."""
+    from solar_cli.envs.offscreen import load_mujoco, make_renderer
 
-
-def _loads(library: str) -> bool:
-    found = ctypes.util.find_library(library)
     try:
-        return found is not None and ctypes.CDLL(found) is not None
-    except OSError:
-        return False
+        mujoco = load_mujoco()
+        make_renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8).render()
+    except UsageError as error:
+        return Check("GL", str(error), Verdict.DOUBTFUL, "only tasks of MuJoCo need this")
+    return Check("GL", f"MuJoCo draws, MUJOCO_GL is {os.environ.get('MUJOCO_GL') or 'not set'}")
