@@ -25,11 +25,13 @@ class Judge:
 
     def evaluate(self, policy: Policy, iteration: int) -> Evaluation:
         """The policy after ``iteration``; 0 is the initial one. The same call, the same numbers."""
+        episodes = self._configuration.evaluation.episodes
+        self._task.expect(episodes)
         return evaluate(
             self._task,
             self._configuration.task,
             policy,
-            self._configuration.evaluation.episodes,
+            episodes,
             self._streams.under(iteration),
         )
 

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from solar_cli.envs import build_task
-from solar_cli.episodes import Environment, Evaluation, Experience
+from solar_cli.episodes import Environment, Episodes, Evaluation, Experience, Policy
 from solar_cli.errors import SolarError
 from solar_cli.experiment.checkpointing import Checkpoints
 from solar_cli.experiment.exhibits import exhibit
@@ -93,8 +93,9 @@ class Session:
         streams, task = Streams(cell.seed), cell.configuration.task
         self._checkpoints = Checkpoints(store, cell.hash, attempt)
         self._judge = Judge(cell, partial(self._pause, "evaluating"))
+        self._simulator = WatchedTask(build_task(task), self._collecting)
         self.environment = Environment(
-            WatchedTask(build_task(task), self._collecting),
+            self._simulator,
             task,
             streams.under("environment"),
             store.folder(cell.hash) / "episodes",
@@ -134,7 +135,7 @@ class Session:
         self.environment.begin(self._iteration)
         self._tell("starting")
         experience = Experience(self.environment)
-        experience.collect = self._watch.running("collecting")(experience.collect)
+        experience.collect = self._collect
         try:
             with self._watch.running("control"):
                 learned = self.learner.iterate(experience)
@@ -144,6 +145,12 @@ class Session:
         metrics = learned | self.environment.summary(self._iteration)
         self._unsaved = True
         return {name: float(value) for name, value in metrics.items()}
+
+    def _collect(self, policy: Policy, episodes: int, *, noisy: bool = True) -> Episodes:
+        """As `Environment.collect`, watched and timed."""
+        self._simulator.expect(episodes)
+        with self._watch.running("collecting"):
+            return self.environment.collect(policy, episodes, noisy=noisy)
 
     def _conclude(self, train: dict[str, float]) -> None:
         """Evaluate; then checkpoint file, metrics and progress become durable, in this order."""

@@ -1,10 +1,11 @@
 """An iteration that was interrupted where it may be ends with the bits of one that was not."""
 
+from itertools import count
+
 import pytest
 from method_runs import Run
 
 from solar_cli.errors import SolarError
-from solar_cli.experiment.watched import WatchedTask
 
 FINE_TUNING = ("training.fine_tune_steps=8", "training.fine_tune_rate=0.003")
 FLOORS = ("update.early_updates=1", "update.std_floor=[0.95, 0.3]", "update.kl_step=5.0")
@@ -43,11 +44,14 @@ def test_a_run_interrupted_while_it_collects_ends_with_the_same_bits(tmp_path, n
     sets = (*FINE_TUNING, f"batches.noise_free={noise_free}")
     last, saved = 3, []
 
-    def halfway(share):
-        if share == 0.5:
-            saved.append((whole.environment.iteration, whole.state()))
+    steps = count(1)
 
-    whole = Run(tmp_path, name, *sets, wrap=lambda task: WatchedTask(task, halfway))
+    def halfway(iteration, costs):
+        if next(steps) % 6 == 3:  # of the six steps of an episode
+            saved.append((iteration, whole.state()))
+        return costs
+
+    whole = Run(tmp_path, name, *sets, costs=halfway)
     whole.iterate(1, last)
     assert [iteration for iteration, _ in saved] == sorted([1, 2, 3] * (1 + bool(noise_free)))
     for iteration, state in saved:

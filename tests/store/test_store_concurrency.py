@@ -168,7 +168,7 @@ def test_who_opens_while_another_creates_waits_for_it(address: str) -> None:
             second = threads.submit(Store.open, address)
             with pytest.raises(TimeoutError):
                 second.result(timeout=0.3)
-        with second.result(timeout=30) as store:
+        with second.result(timeout=200) as store:
             assert store.cells() == []
     first.close()
 
@@ -182,7 +182,7 @@ def test_all_statements_of_a_reading_see_one_moment(store: Store) -> None:
             adding = threads.submit(store.add, [nav(0)])
             wait([adding], timeout=0.3)
             assert session.scalars(count).one() == 0
-        adding.result(timeout=30)
+        adding.result(timeout=200)
     assert len(store.cells()) == 1
 
 
@@ -194,7 +194,7 @@ def test_writes_to_one_cell_wait_for_each_other(claimed: tuple[Store, str, int])
             later = threads.submit(store.beat, hash, attempt, "later", 0.5)
             with pytest.raises(TimeoutError):
                 later.result(timeout=0.3)
-        later.result(timeout=30)
+        later.result(timeout=200)
     assert store.attempts(hash)[0].activity == "later"
 
 
