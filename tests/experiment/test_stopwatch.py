@@ -156,9 +156,11 @@ def test_what_a_method_trains_is_not_counted_twice(
 
 
 def test_an_interrupted_iteration_has_the_seconds_of_all_its_attempts(
-    store: Store, make_cells: Callable[..., list[Cell]]
+    store: Store, make_cells: Callable[..., list[Cell]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    cell = make_cells(nap=NAP)[0]
+    cell = make_cells()[0]
+    # In each of an iteration's three steps.
+    monkeypatch.setattr(fake_method.Fake, "_hold", lambda self, iteration: time.sleep(NAP))
     with pytest.raises(Stopped):
         attempt(store, cell, Boss(stop_at=10), every=1e9)
     assert not store.checkpoints(cell.hash)[0].complete
