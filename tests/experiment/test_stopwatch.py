@@ -160,9 +160,9 @@ def test_an_interrupted_iteration_has_the_seconds_of_all_its_attempts(
 ) -> None:
     cell = make_cells()[0]
     # In each of an iteration's three steps.
-    monkeypatch.setattr(fake_method.Fake, "_hold", lambda self, iteration: time.sleep(NAP))
+    monkeypatch.setattr(fake_method.Fake, "_fail", lambda self, iteration: time.sleep(NAP))
     with pytest.raises(Stopped):
-        attempt(store, cell, Boss(stop_at=10), every=1e9)
+        attempt(store, cell, Boss(stop_at=2, activity="walking"), every=1e9)
     assert not store.checkpoints(cell.hash)[0].complete
     attempt(store, cell, every=1e9, target=TARGET)
     for iteration in (1, 2, 3):
