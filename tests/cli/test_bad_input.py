@@ -30,6 +30,12 @@ FAULTS = {
     "no seeds": (("--seeds", "0"), ["--seeds '0'"]),
     "budget of zero": (("--budget", "0"), ["--budget '0'", "desk, full or a number"]),
     "budget that is none": (("--budget", "lots"), ["--budget 'lots'"]),
+    "budget beyond counting": (("--budget", "9" * 23), ["--budget '999", "1000000000"]),
+    "budget beyond reading": (("--budget", "9" * 5000), ["--budget '999", "1000000000"]),
+    "budget of a setting beyond counting": (
+        ("--set", f"methods.solar.budget.desk={10**19}"),
+        ["'methods.solar.budget.desk'", "1000000000"],
+    ),
     "label that is no name": (("--set", "task.horizon=9", "--label", "A B"), ["--label 'A B'"]),
     "no workers": (("--workers", "0"), ["--workers", "1"]),
     "unknown device": (("--device", "tpu"), ["--device", "tpu", "cpu"]),
