@@ -187,6 +187,7 @@ def test_an_export_overwrites_nothing_unasked(solar: Solar, stored: Stored, tmp_
 
 
 def test_a_missing_database_is_said_and_none_is_made(solar: Solar, tmp_path: Path) -> None:
-    for command in ("status", "export", "report", "compare"):
-        solar(command, "--db", tmp_path / "absent.db").refused("absent.db", "solar run")
-    assert not (tmp_path / "absent.db").exists()
+    commands = (("status",), ("export",), ("report",), ("compare",), ("show", "ab"), ("rm", "ab"))
+    for command in (*commands, ("rm", "--task", "nav", "--yes")):
+        solar(*command, "--db", tmp_path / "absent.db").refused("absent.db", "solar run")
+    assert list(tmp_path.iterdir()) == []
