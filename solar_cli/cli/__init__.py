@@ -48,6 +48,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     2 for bad input, 1 for what could not be done, 130 after Ctrl-C.
     """
     gc.set_threshold(GARBAGE_AFTER)
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by whoever started this
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal may lack a letter of a table

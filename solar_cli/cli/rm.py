@@ -35,7 +35,7 @@ def command(
         raise UsageError(
             "name the cells to remove by their hashes, or by --task, --method and --variant"
         )
-    with Store.open(db) as store:
+    with Store.open(db, read_only=True) as store:  # a slip in --db makes no database
         if cells:
             named = [store.find(prefix) for prefix in cells]
             records = list({record.hash: record for record in named}.values())
@@ -48,7 +48,8 @@ def command(
             ("cell", "title", "state", "episodes>"),
             [(r.hash[:8], r.cell.title, r.state.value, r.episodes) for r in records],
         )
-        if not yes:
-            typer.confirm(f"Remove {len(records)} with all files?", abort=True)
+    if not yes:
+        typer.confirm(f"Remove {len(records)} with all files?", abort=True)
+    with Store.open(db) as store:
         store.remove([record.hash for record in records])
     say(f"removed {len(records)}")

@@ -112,8 +112,10 @@ class Line:
             return ""
         if self.record.state in (State.FAILED, State.DIVERGED):
             return last.error or "no cause was recorded"
+        if self.record.state is State.INTERRUPTED:
+            return last.error or f"process {last.owner.pid} on {last.owner.host} is gone"
         if self.record.state is State.RUNNING:
-            return f"{last.activity} {last.fraction:.0%}"
+            return f"{last.activity} {last.fraction:.0%}" if last.activity else "starting"
         return ""
 
     def plain(self) -> dict[str, Any]:

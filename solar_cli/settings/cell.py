@@ -13,7 +13,7 @@ from typing import Any, Literal
 from solar_cli.errors import UsageError
 from solar_cli.settings.card import NAME, Card, Configuration, resolve
 from solar_cli.settings.registry import method, settings_class
-from solar_cli.settings.schema import completed, hashed_values
+from solar_cli.settings.schema import MOST_EPISODES, completed, hashed_values
 from solar_cli.settings.task import EvaluationSettings, TaskSettings
 
 LONGEST_NAME = 60  # of a variant: it names files of a report and columns of a table
@@ -170,6 +170,11 @@ def parse_budget(text: str) -> Literal["desk", "full"] | int:
         return "desk"
     if text == "full":
         return "full"
-    if not text.isdecimal() or int(text) == 0:
-        raise UsageError(f"--budget {text!r}: expected desk, full or a number of episodes above 0")
+    # Its length first: Python refuses to read a number of thousands of digits.
+    known = text.isdecimal() and len(text) <= 2 * len(str(MOST_EPISODES))
+    if not known or not 0 < int(text) <= MOST_EPISODES:
+        raise UsageError(
+            f"--budget {text!r}: expected desk, full or a number of episodes from 1 to "
+            f"{MOST_EPISODES}"
+        )
     return int(text)

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from solar_cli.settings.networks import BUMPS, KEY_POINTS, Layer
-from solar_cli.settings.schema import Settings, setting
+from solar_cli.settings.schema import MOST_EPISODES, Settings, setting
 
 Positive = Annotated[float, Field(gt=0)]
 
@@ -15,8 +15,8 @@ Positive = Annotated[float, Field(gt=0)]
 class Budget(Settings):
     """Where to stop, in episodes; never part of a cell's identity."""
 
-    desk: int = setting(..., "episodes for an evening", presentation=True, ge=1)
-    full: int = setting(..., "episodes of the paper", presentation=True, ge=1)
+    desk: int = setting(..., "episodes for an evening", presentation=True, ge=1, le=MOST_EPISODES)
+    full: int = setting(..., "episodes of the paper", presentation=True, ge=1, le=MOST_EPISODES)
 
 
 class Batches(Settings):

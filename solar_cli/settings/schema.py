@@ -17,6 +17,8 @@ from pydantic.fields import FieldInfo
 
 OURS = "ours"
 """Source of a value that the paper does not give or that we chose otherwise."""
+MOST_EPISODES = 10**9
+"""of one cell: what every database can count"""
 
 
 class Settings(BaseModel):

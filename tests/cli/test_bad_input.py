@@ -30,6 +30,12 @@ FAULTS = {
     "no seeds": (("--seeds", "0"), ["--seeds '0'"]),
     "budget of zero": (("--budget", "0"), ["--budget '0'", "desk, full or a number"]),
     "budget that is none": (("--budget", "lots"), ["--budget 'lots'"]),
+    "budget beyond counting": (("--budget", "9" * 23), ["--budget '999", "1000000000"]),
+    "budget beyond reading": (("--budget", "9" * 5000), ["--budget '999", "1000000000"]),
+    "budget of a setting beyond counting": (
+        ("--set", f"methods.solar.budget.desk={10**19}"),
+        ["'methods.solar.budget.desk'", "1000000000"],
+    ),
     "label that is no name": (("--set", "task.horizon=9", "--label", "A B"), ["--label 'A B'"]),
     "no workers": (("--workers", "0"), ["--workers", "1"]),
     "unknown device": (("--device", "tpu"), ["--device", "tpu", "cpu"]),
@@ -181,6 +187,7 @@ def test_an_export_overwrites_nothing_unasked(solar: Solar, stored: Stored, tmp_
 
 
 def test_a_missing_database_is_said_and_none_is_made(solar: Solar, tmp_path: Path) -> None:
-    for command in ("status", "export", "report", "compare"):
-        solar(command, "--db", tmp_path / "absent.db").refused("absent.db", "solar run")
-    assert not (tmp_path / "absent.db").exists()
+    commands = (("status",), ("export",), ("report",), ("compare",), ("show", "ab"), ("rm", "ab"))
+    for command in (*commands, ("rm", "--task", "nav", "--yes")):
+        solar(*command, "--db", tmp_path / "absent.db").refused("absent.db", "solar run")
+    assert list(tmp_path.iterdir()) == []

@@ -154,6 +154,21 @@ def test_a_reader_that_leaves_early_is_met_with_silence(command: str) -> None:
     assert (done.returncode, done.stderr) == (1, "")
 
 
+@pytest.mark.parametrize(
+    ("command", "closed", "code"),
+    [("methods", ">&-", 0), ("methods --json", ">&-", 0), ("tasks absent", "2>&-", 2)],
+)
+def test_a_closed_stream_is_written_to_in_silence(command: str, closed: str, code: int) -> None:
+    program = "import sys; from solar_cli.cli import main; sys.exit(main())"
+    done = subprocess.run(
+        ["bash", "-c", f'"$0" -c "$1" {command} {closed}', sys.executable, program],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (code, "", "")
+
+
 def complete(line: str) -> str:
     """What bash would offer for a command line; its last word is being typed."""
     program = "import sys; from solar_cli.cli import main; sys.exit(main([]))"

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 from scenario import Done, Solar, Stored
+from stored_cells import store_attempt
 
 from solar_cli.store.owner import Owner
-from solar_cli.store.records import Metric
+from solar_cli.store.records import Metric, Outcome
 from solar_cli.store.store import Store
 
 CONTROLS = ("\x1b", "\x07", "\r")
@@ -33,6 +34,24 @@ def test_status_shows_the_state_of_every_cell(solar: Solar, stored: Stored) -> N
     assert (
         "7 cells: 1 diverged, 1 failed, 2 finished, 1 interrupted, 1 pending, 1 stale" in done.out
     )
+
+
+def test_status_says_why_a_cell_was_interrupted_and_what_a_running_one_does(
+    solar: Solar, stored: Stored
+) -> None:
+    def note() -> str:
+        entries = json.loads(solar("status", "--json", "--db", stored.db).out)
+        [said] = [entry["note"] for entry in entries if entry["cell"] == stored.interrupted.hash]
+        return str(said)
+
+    assert "is gone" in note()  # its process could not say why
+    with Store.open(str(stored.db)) as store:
+        attempt = store_attempt(store, stored.interrupted, [], None, {})
+        assert note() == "starting"
+        store.beat(stored.interrupted.hash, attempt, "training", 0.5)
+        assert note() == "training 50%"
+        store.end(stored.interrupted.hash, attempt, Outcome.INTERRUPTED, "its files are lost")
+    assert note() == "its files are lost"
 
 
 def test_status_as_json_has_the_same_facts(solar: Solar, stored: Stored) -> None:
