@@ -122,7 +122,7 @@ def command(
 
         with watching(json, len(work)) as report:
             results = run(plans, store, workers=workers, report=report, device=device.value)
-    print_results(results, json, db)
+    print_results(results, json, db, redo=redo)
     if not all(result.finished for result in results):
         raise typer.Exit(1)
 
