@@ -5,7 +5,6 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -168,8 +167,7 @@ def planning_store(db: str | None) -> Iterator[Store]:
     from solar_cli.store.address import locate
     from solar_cli.store.store import Store
 
-    place = locate(db).place
-    if isinstance(place, Path) and not place.exists():
+    if locate(db).is_new:
         with tempfile.TemporaryDirectory() as folder, Store.open(f"{folder}/solar.db") as store:
             yield store
     else:

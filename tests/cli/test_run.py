@@ -44,6 +44,10 @@ def test_a_dry_run_without_a_database_makes_none(solar: Solar, tmp_path: Any) ->
     done = solar(*SMOKE, "--dry-run", "--db", tmp_path / "new" / "solar.db")
     assert (done.code, "not yet computed" in done.out) == (0, True)
     assert list(tmp_path.iterdir()) == []
+    (tmp_path / "empty.db").touch()  # as a disk that was full leaves it
+    done = solar(*SMOKE, "--dry-run", "--db", tmp_path / "empty.db")
+    assert (done.code, "not yet computed" in done.out) == (0, True)
+    assert (tmp_path / "empty.db").read_bytes() == b""
 
 
 @pytest.mark.parametrize(
