@@ -311,14 +311,23 @@ def validated(model: type[S], table: Any, where: str, path: str = "") -> S:
         made = model.model_validate(table)
     except ValidationError as error:
         mistakes = []
-        for fault in error.errors(include_url=False):
+        faults = error.errors(include_url=False)
+        for fault in faults:
+            depth = len(fault["loc"])
+            if fault["type"] == "too_short" and any(
+                len(other["loc"]) > depth and other["loc"][:depth] == fault["loc"]
+                for other in faults
+            ):
+                continue  # entries that are wrong were left out before they were counted
             key = ".".join([path] * bool(path) + [str(part) for part in fault["loc"]])
             if fault["type"] == "extra_forbidden":
                 siblings = _siblings(model, fault["loc"])
                 mistakes.append(f"unknown key {key!r} ({nearest(str(fault['loc'][-1]), siblings)})")
             else:
                 given = "" if fault["type"] == "missing" else f", not {fault['input']!r}"
-                mistakes.append(f"{key!r}: {fault['msg']}{given}")
+                table = fault["type"] in ("dict_type", "model_type")
+                said = "Input should be a table" if table else fault["msg"]
+                mistakes.append(f"{key!r}: {said}{given}")
         raise UsageError(f"{where}: {'; '.join(mistakes)}") from error
     mistakes = [
         f"{key!r}: Input should be {expected}, not {given!r}"
