@@ -92,13 +92,14 @@ def command(
         require_memory,
         require_tasks,
     )
-    from solar_cli.cli.shadowing import tell_shadowed
+    from solar_cli.cli.shadowing import tell_misspelt, tell_shadowed
     from solar_cli.experiment.matrix import plan
     from solar_cli.settings import parse_budget
 
     matrix = cells_of(tasks, methods, seeds, variant, sets or (), label)
     wanted = parse_budget(budget)
     tell_shadowed(tasks)
+    tell_misspelt(tasks)
     with planning_store(db) if dry_run else _store(db) as store:
         plans = plan(store, matrix, wanted, redo=redo, retry=retry)
         work = [planned.cell for planned in plans if planned.is_work]
