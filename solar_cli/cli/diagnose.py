@@ -55,11 +55,12 @@ def command(
     """
     from solar_cli.cli.preflight import require_learners, require_tasks
     from solar_cli.cli.run import cells_of
-    from solar_cli.cli.shadowing import tell_shadowed
+    from solar_cli.cli.shadowing import tell_misspelt, tell_shadowed
     from solar_cli.experiment.engine import ENVIRONMENT
 
     [cell] = cells_of([task], [method], f"{seed}:{seed + 1}", variant, sets or (), None)
     tell_shadowed([task])
+    tell_misspelt([task])
     # Before torch is imported: the same bits as a worker has.
     os.environ.update(ENVIRONMENT)
 

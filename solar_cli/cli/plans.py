@@ -9,8 +9,8 @@ from typing import Any
 from solar_cli.cli.printing import clean, duration, print_json, print_table, say
 from solar_cli.experiment.estimates import Estimate
 from solar_cli.experiment.matrix import Action, Plan
-from solar_cli.experiment.scheduler import Result, default_workers
-from solar_cli.store.records import Outcome
+from solar_cli.experiment.scheduler import STOPPED, Result, default_workers
+from solar_cli.store.records import Outcome, State
 from solar_cli.wording import counted
 
 
@@ -92,9 +92,14 @@ def mebibytes(size: int | None) -> str:
     return "unknown" if size is None else f"{size / 2**20:.0f} MiB"
 
 
-def print_results(results: Sequence[Result], json: bool, db: str | None) -> None:
-    """What was done, a table of causes where something is missing, and what to do next."""
-    done = Counter(_kind(result) for result in results)
+def print_results(
+    results: Sequence[Result], json: bool, db: str | None, *, redo: bool = False
+) -> None:
+    """What was done, a table of causes where something is missing, and what to do next.
+
+    ``redo`` is whether the command said so.
+    """
+    done = Counter(kind(result) for result in results)
     missing = [result for result in results if not result.finished]
     if json:
         print_json(
@@ -123,16 +128,39 @@ def print_results(results: Sequence[Result], json: bool, db: str | None) -> None
         print_table(
             ("cell", "title", "outcome", "cause"),
             [
-                (result.plan.cell.hash[:8], result.plan.cell.title, _kind(result), result.cause)
+                (result.plan.cell.hash[:8], result.plan.cell.title, kind(result), result.cause)
                 for result in missing
             ],
             "Not finished",
         )
     say("next:")
-    if any(_stopped(result) for result in results):
-        say("  the same command again, which goes on from here")
-    for command in next_commands(results, db):
-        say(f"  {command}")
+    for line in [*next_steps(results, redo), *next_commands(results, db)]:
+        say(f"  {line}")
+
+
+def next_steps(results: Sequence[Result], redo: bool) -> list[str]:
+    """How to get what is missing."""
+    stopped = [result for result in results if _stopped(result)]
+    again = {result.plan.cell.seed for result in stopped if result.outcome is None and redo}
+    left = [result.plan.record for result in results if result.plan.action is Action.BLOCKED]
+    states = {record.state for record in left if record is not None}
+    ends = {result.outcome for result in results}
+    steps = []
+    if stopped:
+        when = "" if all(map(_by_request, stopped)) else "once the cause is put right, "
+        how = (
+            "without --redo, which goes on with what was begun" if redo else "again, which goes on"
+        )
+        steps += [f"{when}the same command {how} from here"]
+    if again:  # the same seeds would discard again what was begun
+        seeds = ",".join(map(str, sorted(again)))
+        one = "," * (len(again) == 1)  # a number alone is how many
+        steps += [f"for what was not started, the same command with --seeds {seeds}{one}"]
+    if State.RUNNING in states:
+        steps += ["the same command again, once the other run has ended"]
+    if (ends | states) & {Outcome.FAILED, Outcome.DIVERGED, State.FAILED, State.DIVERGED}:
+        steps += ["--retry takes up what failed or diverged, once the cause is put right"]
+    return steps
 
 
 def _stopped(result: Result) -> bool:
@@ -140,7 +168,12 @@ def _stopped(result: Result) -> bool:
     return result.outcome is Outcome.INTERRUPTED or (result.outcome is None and result.plan.is_work)
 
 
-def _kind(result: Result) -> str:
+def _by_request(result: Result) -> bool:
+    """Whether somebody stopped the cell; else it was something, such as a full disk."""
+    return result.cause.startswith(("stopped", "the worker was ended", STOPPED))
+
+
+def kind(result: Result) -> str:
     """What became of a cell, in a word or two."""
     if result.outcome is not None:
         return result.outcome.value

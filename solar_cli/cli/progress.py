@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from solar_cli.cli.plans import kind
 from solar_cli.cli.printing import console, duration, number, print_json, say, table
 from solar_cli.wording import counted
 
@@ -125,8 +126,7 @@ def plain_line(event: Event) -> str:
     reached = f"{episodes}/{counted(event.plan.target, 'episode')}"
     where = "" if message is None else f"iteration {iteration}, {reached}"
     if event.kind == "ended" and result is not None:
-        outcome = "not started" if result.outcome is None else result.outcome.value
-        parts = [f"{title}: {outcome}", where, headline(event), result.cause]
+        parts = [f"{title}: {kind(result)}", where, headline(event), result.cause]
     else:
         left = f"{duration(event.seconds_left)} left" if event.seconds_left else ""
         parts = [f"{title}: {where}", headline(event), left]

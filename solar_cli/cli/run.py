@@ -5,7 +5,6 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -93,13 +92,14 @@ def command(
         require_memory,
         require_tasks,
     )
-    from solar_cli.cli.shadowing import tell_shadowed
+    from solar_cli.cli.shadowing import tell_misspelt, tell_shadowed
     from solar_cli.experiment.matrix import plan
     from solar_cli.settings import parse_budget
 
     matrix = cells_of(tasks, methods, seeds, variant, sets or (), label)
     wanted = parse_budget(budget)
     tell_shadowed(tasks)
+    tell_misspelt(tasks)
     with planning_store(db) if dry_run else _store(db) as store:
         plans = plan(store, matrix, wanted, redo=redo, retry=retry)
         work = [planned.cell for planned in plans if planned.is_work]
@@ -122,7 +122,7 @@ def command(
 
         with watching(json, len(work)) as report:
             results = run(plans, store, workers=workers, report=report, device=device.value)
-    print_results(results, json, db)
+    print_results(results, json, db, redo=redo)
     if not all(result.finished for result in results):
         raise typer.Exit(1)
 
@@ -168,8 +168,7 @@ def planning_store(db: str | None) -> Iterator[Store]:
     from solar_cli.store.address import locate
     from solar_cli.store.store import Store
 
-    place = locate(db).place
-    if isinstance(place, Path) and not place.exists():
+    if locate(db).is_new:
         with tempfile.TemporaryDirectory() as folder, Store.open(f"{folder}/solar.db") as store:
             yield store
     else:

@@ -1,11 +1,13 @@
-"""Cards of ``./tasks`` that hide a card of the same name that comes with Solar."""
+"""What is odd about cards, though not wrong: one line on standard error."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from difflib import get_close_matches
 from pathlib import Path
 
 from solar_cli.cli.printing import complain
+from solar_cli.settings import load_card, method_names
 from solar_cli.settings.card import card_folders
 
 
@@ -20,3 +22,20 @@ def tell_shadowed(names: Iterable[str]) -> None:
         files = card_files(name)
         if len(files) > 1 and not files[0].samefile(files[1]):
             complain(f"solar: note: {files[0]} is used instead of the built-in card {name!r}")
+
+
+def tell_misspelt(names: Iterable[str]) -> None:
+    """One line for each method that a card speaks of, is not here, and looks like one that is.
+
+    Its settings have no effect. Any other unknown method is taken for that of a package.
+    """
+    known = method_names()
+    for name in dict.fromkeys(names):
+        card = load_card(name)
+        layers = [card.tables, *card.tables.get("variants", {}).values()]
+        for method in sorted({method for layer in layers for method in layer.get("methods", {})}):
+            if method not in known and (close := get_close_matches(method, known, n=1)):
+                complain(
+                    f"solar: note: card {card.path}: 'methods.{method}' has no effect, as no such "
+                    f"method is installed: did you mean {close[0]!r}?"
+                )

@@ -39,13 +39,14 @@ def command(
     Example:
       solar tasks nav --method solar --variant smoke
     """
-    from solar_cli.cli.shadowing import card_files, tell_shadowed
+    from solar_cli.cli.shadowing import card_files, tell_misspelt, tell_shadowed
     from solar_cli.settings import card_names, load_card, resolve
 
     if name is not None:
         from solar_cli.cli.configuration import print_lines, resolved_lines
 
         tell_shadowed([name])
+        tell_misspelt([name])
         print_lines(
             resolved_lines(resolve(load_card(name), method, variant, sets or ()), method), json
         )

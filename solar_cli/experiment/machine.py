@@ -76,7 +76,7 @@ def store(address: str | None) -> Iterator[Check]:
     """The database, and the folder of the cells' files."""
     try:
         location = locate(address)
-        if isinstance(location.place, Path) and not location.place.exists():
+        if location.is_new:
             yield Check("database", f"{location}: none yet, the first run makes it")
             yield Check("SQLite", sqlite3.sqlite_version)
         else:

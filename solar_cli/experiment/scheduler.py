@@ -42,7 +42,7 @@ terminal may send SIGHUP twice, and a launcher may forward what the terminal has
 CHECKPOINT_SECONDS = 60.0
 """between checkpoints inside an iteration: a run that is killed every few minutes still ends, and
 saving, some 20 ms, costs nothing"""
-STOPPED = "not started: the run was stopped"
+STOPPED = "the run was stopped"
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from solar_cli.settings.task import EvaluationSettings, TaskSettings
 PACKAGED = Path(__file__).parent.parent / "_tasks"
 CHECKOUT = Path(__file__).parent.parent.parent / "tasks"
 NAME = re.compile(r"[a-z0-9][a-z0-9_.-]*\Z")
+NAMED = "lower-case letters, digits, '-', '_' and '.'"
 Table = dict[str, Any]
 S = TypeVar("S", bound=BaseModel)
 
@@ -109,20 +110,28 @@ def load_card(name: str) -> Card:
 
 def _read(path: Path) -> Card:
     if not NAME.match(path.stem):
-        raise UsageError(
-            f"card {path}: a task's name has lower-case letters, digits, '-', '_' and '.' only; "
-            "rename the file"
-        )
+        raise UsageError(f"card {path}: a task's name has {NAMED} only; rename the file")
     tables = _toml(path)
     if "extends" in tables:
         tables = _extended(tables, path)
     card = Card(path.stem, path, tables)
     validated(CardTables, tables, f"card {path}")
+    for variant in tables.get("variants", {}):
+        # A report names files by it.
+        if not NAME.match(variant) or variant == "default":
+            raise UsageError(
+                f"card {path}: 'variants.{variant}': a variant's name has {NAMED} only, and "
+                "'default' is the card without any; rename it"
+            )
     for variant in card.variants:
         for name in tables.get("methods", {}):
             # Methods of packages that are not installed here are left to those who have them.
             if name in method_names() and _changes(card, variant, name):
-                resolve(card, name, variant)
+                try:
+                    resolve(card, name, variant)
+                except UsageError as error:
+                    place = "" if f"card {path}" in str(error) else f"card {path}: "
+                    raise UsageError(f"{place}{error}") from error
     return card
 
 
@@ -302,14 +311,23 @@ def validated(model: type[S], table: Any, where: str, path: str = "") -> S:
         made = model.model_validate(table)
     except ValidationError as error:
         mistakes = []
-        for fault in error.errors(include_url=False):
+        faults = error.errors(include_url=False)
+        for fault in faults:
+            depth = len(fault["loc"])
+            if fault["type"] == "too_short" and any(
+                len(other["loc"]) > depth and other["loc"][:depth] == fault["loc"]
+                for other in faults
+            ):
+                continue  # entries that are wrong were left out before they were counted
             key = ".".join([path] * bool(path) + [str(part) for part in fault["loc"]])
             if fault["type"] == "extra_forbidden":
                 siblings = _siblings(model, fault["loc"])
                 mistakes.append(f"unknown key {key!r} ({nearest(str(fault['loc'][-1]), siblings)})")
             else:
                 given = "" if fault["type"] == "missing" else f", not {fault['input']!r}"
-                mistakes.append(f"{key!r}: {fault['msg']}{given}")
+                table = fault["type"] in ("dict_type", "model_type")
+                said = "Input should be a table" if table else fault["msg"]
+                mistakes.append(f"{key!r}: {said}{given}")
         raise UsageError(f"{where}: {'; '.join(mistakes)}") from error
     mistakes = [
         f"{key!r}: Input should be {expected}, not {given!r}"

@@ -31,6 +31,13 @@ class Location:
             return f"sqlite:///{self.place}"
         return self.place.render_as_string(hide_password=False)
 
+    @property
+    def is_new(self) -> bool:
+        """Whether a file is still to be made, or is as empty as a failed attempt leaves it."""
+        if not isinstance(self.place, Path):
+            return False
+        return not self.place.exists() or (self.place.is_file() and not self.place.stat().st_size)
+
     def __str__(self) -> str:
         """For messages: the file, or the address without its password."""
         return str(self.place)

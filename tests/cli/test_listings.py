@@ -306,6 +306,21 @@ def test_a_card_that_hides_a_built_in_one_is_told_of(solar: Solar, tmp_path: Pat
     assert solar(*run, "tasks/nav.toml").err == ""
 
 
+def test_a_card_that_misspells_a_method_is_told_of(solar: Solar, tmp_path: Path) -> None:
+    (tmp_path / "tasks").mkdir()
+    card = tmp_path / "tasks" / "mine.toml"
+    card.write_text(
+        'extends = "nav"\n[methods.sollar]\nbatches.initial = 3\n'
+        "[variants.big.methods.vaee]\nbatches.initial = 3\n"
+        "[methods.random-search]\nbudget = { desk = 1, full = 2 }\n"
+    )
+    for command in (("tasks", "mine"), ("run", "--method", "solar", "--dry-run", "--task", "mine")):
+        done = solar(*command)
+        assert (done.code, done.err.count("\n")) == (0, 2), done
+        assert "tasks/mine.toml: 'methods.sollar'" in done.err
+        assert "did you mean 'vae'?" in done.err
+
+
 def test_show_says_where_the_time_went(solar: Solar, stored: Stored) -> None:
     with Store.open(str(stored.db)) as store:
         attempt = store.claim(stored.pending.hash, Owner.current(), 8, {})

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 from scenario import Solar, Stored
+from stored_cells import store_attempt
 
 from solar_cli.cli import progress
 from solar_cli.experiment import scheduler
@@ -14,6 +15,7 @@ from solar_cli.experiment.messages import Message
 from solar_cli.experiment.scheduler import Event, Result
 from solar_cli.settings import cells, load_card
 from solar_cli.store.records import Outcome
+from solar_cli.store.store import Store
 
 SMOKE = ("run", "--task", "nav", "--method", "solar", "--variant", "smoke")
 
@@ -42,6 +44,10 @@ def test_a_dry_run_without_a_database_makes_none(solar: Solar, tmp_path: Any) ->
     done = solar(*SMOKE, "--dry-run", "--db", tmp_path / "new" / "solar.db")
     assert (done.code, "not yet computed" in done.out) == (0, True)
     assert list(tmp_path.iterdir()) == []
+    (tmp_path / "empty.db").touch()  # as a disk that was full leaves it
+    done = solar(*SMOKE, "--dry-run", "--db", tmp_path / "empty.db")
+    assert (done.code, "not yet computed" in done.out) == (0, True)
+    assert (tmp_path / "empty.db").read_bytes() == b""
 
 
 @pytest.mark.parametrize(
@@ -206,7 +212,34 @@ def test_after_an_interruption_the_same_command_is_said_to_go_on(
     out = solar(*SMOKE, "--db", tmp_path / "solar.db").out
     assert "same command" in out[out.index("next:") :].splitlines()[1]
     monkeypatch.setattr(scheduler, "run", fake_run([(Outcome.FAILED, "broken")]))
-    assert "same command" not in solar(*SMOKE, "--db", tmp_path / "solar.db").out
+    out = solar(*SMOKE, "--db", tmp_path / "solar.db").out
+    assert "same command" not in out
+    assert "--retry" in out[out.index("next:") :]
+
+
+def test_the_next_step_after_an_interruption_keeps_what_was_computed(
+    solar: Solar, stored: Stored, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def steps(ends: Sequence[tuple[Outcome | None, str]], *options: str) -> list[str]:
+        monkeypatch.setattr(scheduler, "run", fake_run(ends))
+        out = solar(*SMOKE, "--seeds", str(len(ends)), *options, "--db", stored.db).out
+        return [line.strip() for line in out[out.index("next:") :].splitlines()[1:]]
+
+    request, waiting = (Outcome.INTERRUPTED, "stopped on request"), (None, scheduler.STOPPED)
+    first, second, *_ = steps([request, waiting], "--redo")
+    assert first.startswith("the same command without --redo")
+    assert second.endswith("--seeds 1,")
+    lost = (Outcome.INTERRUPTED, "checkpoints are missing or damaged")
+    assert steps([lost], "--budget", "99")[0].startswith("once the cause is put right, the same")
+
+
+def test_a_cell_of_another_run_is_said_to_be_awaited(solar: Solar, stored: Stored) -> None:
+    with Store.open(str(stored.db)) as store:
+        store_attempt(store, stored.interrupted, [], None, {})
+        out = solar(*SMOKE, "--seeds", "3:4", "--db", stored.db).out
+    assert "the same command again, once the other run has ended" in out
+    done = Event("ended", plans(1)[0], result=Result(plans(1)[0], None, scheduler.STOPPED))
+    assert progress.plain_line(done).endswith("seed 0: not started, the run was stopped")
 
 
 def test_one_cell_is_not_spoken_of_as_several(solar: Solar, stored: Stored) -> None:

@@ -22,6 +22,8 @@ def test_a_database_that_is_not_there_yet_is_no_fault(tmp_path: Path) -> None:
     found = list(checks(str(tmp_path / "runs" / "solar.db")))
     assert Verdict.BAD not in verdicts(found).values()
     assert list(tmp_path.iterdir()) == []
+    (tmp_path / "empty.db").touch()  # as a disk that was full leaves it
+    assert Verdict.BAD not in verdicts(list(machine.store(str(tmp_path / "empty.db")))).values()
 
 
 def test_what_is_no_database_is_bad(tmp_path: Path) -> None:

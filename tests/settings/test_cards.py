@@ -111,6 +111,8 @@ CARD_FAULTS = {
         '[variants.v.methods.solar.representation]\nencoder = [{ kind = "cnov" }]',
         ["encoder", "'cnov'", "'conv'"],
     ),
+    "variant named as no file is": ('[variants."../A B"]\ntask.horizon = 3', ["'variants.../A B'"]),
+    "variant named default": ("[variants.default]\ntask.horizon = 3", ["'variants.default'"]),
     "unknown path in a variant": ("[variants.v]\nhorizon = 3", ["variant v", "'horizon'", "task"]),
 }
 
@@ -118,7 +120,20 @@ CARD_FAULTS = {
 @pytest.mark.parametrize("fault", CARD_FAULTS)
 def test_a_malformed_card_names_file_place_and_expectation(tmp_path: Path, fault: str) -> None:
     more, expected = CARD_FAULTS[fault]
-    check(lambda: load_card(str(toy(tmp_path, more))), expected)
+    check(lambda: load_card(str(toy(tmp_path, more))), ["toy.toml", *expected])
+
+
+def test_a_wrong_entry_is_one_mistake_and_a_table_is_called_so() -> None:
+    def said(text: str) -> str:
+        with pytest.raises(UsageError) as caught:
+            resolve(load_card("nav"), "solar", "default", [text])
+        return str(caught.value)
+
+    encoder = "methods.solar.representation.encoder"
+    assert "at least 1 item" not in said(f'{encoder}=[{{ kind = "conv" }}]')
+    assert "at least 1 item" in said(f"{encoder}=[]")
+    for path in ("task", "task.parameters", "methods.solar"):
+        assert f"'{path}': Input should be a table, not 3" in said(f"{path}=3")
 
 
 def test_a_card_that_misses_a_value_names_it(tmp_path: Path) -> None:
