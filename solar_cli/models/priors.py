@@ -140,7 +140,7 @@ class DynamicsStatistics(NamedTuple):
     """sum of the logarithms of the variances of z_{t+1}"""
     starts: mniw.RegressionStatistics
     starts_log_variance: Float[Tensor, ""]
-    judged: int
+    judged: int | Tensor
     """frames that these terms judge: S times those of an episode"""
 
 
@@ -217,9 +217,11 @@ class BayesianLDS:
         first, variance = segments.mean[:, 0], segments.variance[:, 0]
         starts = niw.initial_statistics(first, variance, start_weights)
         starts_log_variance = (start_weights * variance.log().sum(dim=-1)).sum()
-        judged = count * (self.horizon + 2 - self.window)
+        judged: int | Tensor = count * (self.horizon + 2 - self.window)
         if segments.live is not None:
             judged = int(segments.live[:, self.window :].sum()) + count
+        elif segments.starts is not None:  # episodes differ: what these segments show, as weighed
+            judged = weights.sum() + start_weights.sum()
         return DynamicsStatistics(transitions, log_variance, starts, starts_log_variance, judged)
 
     def _weights(

@@ -190,6 +190,7 @@ class Dataset:
         decoded = stream.permutation(segments * length)
         decoded = decoded[: max(1, round(settings.decoded * segments * length))]
         horizon = self.episodes.horizon
+        whole = firsts.min() == horizon + 2 - length
         places = (rows * (horizon + 1) + starts)[:, None] + np.arange(length)
         moves = (rows * horizon + starts)[:, None] + np.arange(length - 1)
         return Minibatch(
@@ -198,7 +199,7 @@ class Dataset:
             torch.from_numpy(starts).to(self.device),
             torch.from_numpy(noise).to(self.device),
             torch.from_numpy(decoded).to(self.device),
-            torch.from_numpy(firsts[rows]).to(self.device),
+            None if whole else torch.from_numpy(firsts[rows]).to(self.device),
         )
 
     def _taken(self, flat: Tensor, places: NDArray[np.int64]) -> Tensor:

@@ -87,6 +87,21 @@ def test_segments_are_as_long_as_the_longest_episode_at_most():
     assert batch.frames.shape[1] == 5
 
 
+def every_segment(episodes: Segments, lengths: list[int], length: int) -> list[Segments]:
+    """Each (episode, start) once."""
+    return [
+        Segments(
+            episodes.mean[i : i + 1, s : s + length],
+            episodes.variance[i : i + 1, s : s + length],
+            episodes.actions[i : i + 1, s : s + length - 1],
+            torch.tensor([s]),
+            starts=torch.tensor([n + 2 - length]),
+        )
+        for i, n in enumerate(lengths)
+        for s in range(n + 2 - length)
+    ]
+
+
 @every_form
 @pytest.mark.parametrize("length", [4, 6])
 def test_segments_of_every_start_are_on_average_all_live_steps(factors, rows, window, length):
@@ -94,24 +109,19 @@ def test_segments_of_every_start_are_on_average_all_live_steps(factors, rows, wi
     lengths = [n for n in LENGTHS if n + 1 >= length]
     episodes = masked([n + 1 for n in lengths])
     prior = prior_of(factors, rows, window)
-    firsts = [n + 2 - length for n in lengths]
-    parts = [
-        Segments(
-            episodes.mean[i : i + 1, s : s + length],
-            episodes.variance[i : i + 1, s : s + length],
-            episodes.actions[i : i + 1, s : s + length - 1],
-            torch.tensor([s]),
-            starts=torch.tensor([first]),
-        )
-        for i, first in enumerate(firsts)
-        for s in range(first)
-    ]
+    parts = every_segment(episodes, lengths, length)
     found, whole = [prior.statistics(part) for part in parts], prior.statistics(episodes)
-    scale = sum(firsts) / (T + 2 - length)  # of minibatches of one segment
+    scale = len(parts) / (T + 2 - length)  # of minibatches of one segment
     for name in ("transitions", "starts"):
         for index, expected in enumerate(getattr(whole, name)):
             mean = sum(getattr(part, name)[index] for part in found) / len(parts)
             torch.testing.assert_close(scale * mean, expected, rtol=1e-12, atol=1e-12)
+    together = Segments(
+        *(torch.cat([part[k] for part in parts]) for k in range(4)),
+        starts=torch.cat([part.starts for part in parts]),
+    )
+    kl = prior.kl(prior.statistics(together))  # nats a frame that is judged, by either
+    torch.testing.assert_close(kl, prior.kl(whole), rtol=1e-12, atol=1e-12)
 
 
 def test_the_scale_is_that_of_all_segments_there_are():
@@ -122,6 +132,13 @@ def test_the_scale_is_that_of_all_segments_there_are():
     assert batch.starts.tolist() == [
         LENGTHS[int(row)] + 2 - 4 for row in batch.frames[:, 0, 0].tolist()
     ]
+
+
+def test_where_nothing_ends_early_segments_are_those_of_the_horizon():
+    [batch] = draws(Dataset([ended([T, T, T])], "cpu"))
+    assert batch.starts is None
+    [batch] = draws(Dataset([ended([5, 5, 5])], "cpu"))
+    assert batch.starts.tolist() == [4] * 4
 
 
 def test_episodes_too_short_for_a_transition_are_refused():
@@ -188,9 +205,8 @@ def test_kl_is_a_mean_over_live_frames(factors, rows, window):
     prior.conclude(masked(frames, seed=1))
     total, count = 0.0, 0
     for episode, n in zip(cut(masked(frames), frames), frames, strict=True):
-        # A segment of n frames weighs as one of T + 2 - n, a frame as one of a whole episode.
-        total += float(kl(prior, episode)) * (T + 2 - window) / (T + 2 - n)
-        count += n - window + 1  # the transitions, and the first frame
+        judged = n - window + 1  # the transitions, and the first frame
+        total, count = total + judged * float(kl(prior, episode)), count + judged
     assert float(kl(prior, masked(frames))) == pytest.approx(total / count)
 
 

@@ -204,8 +204,7 @@ def test_a_draw_depends_on_its_step_alone():
     alone = draw(data, 17)
     for step in range(17):
         draw(data, step)
-    for left, right in zip(draw(data, 17), alone, strict=True):
-        assert torch.equal(left, right)
+    assert digest(list(draw(data, 17))) == digest(list(alone))
     assert not torch.equal(draw(data, 18).noise, alone.noise)
 
 
