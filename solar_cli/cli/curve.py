@@ -8,14 +8,22 @@ from collections.abc import Sequence
 DOTS = ((0x01, 0x08), (0x02, 0x10), (0x04, 0x20), (0x40, 0x80))
 """Bit of each dot in a Braille character, by row and column (Unicode, block 2800)."""
 BLANK = 0x2800
+PLAIN = {"│": "|", "└": "+", "─": "-"}
 LOGARITHMIC = 30.0
 """Ratio of the largest to the smallest value from which the vertical axis is logarithmic."""
 
 
-def plot(xs: Sequence[float], ys: Sequence[float], width: int = 60, height: int = 12) -> list[str]:
+def plot(
+    xs: Sequence[float],
+    ys: Sequence[float],
+    width: int = 60,
+    height: int = 12,
+    encoding: str = "utf-8",
+) -> list[str]:
     """Lines of text that show ``ys`` over ``xs``; what is not finite leaves a gap.
 
-    ``width`` and ``height`` are those of the plot area in characters.
+    ``width`` and ``height`` are those of the plot area in characters. Where ``encoding`` has no
+    Braille, they are drawn with stars.
     """
     finite = [y for y in ys if math.isfinite(y)]
     if not finite:
@@ -45,7 +53,17 @@ def plot(xs: Sequence[float], ys: Sequence[float], width: int = 60, height: int 
     ends = f"{first:g}".ljust(width - len(f"{last:g}")) + f"{last:g}"
     axis = f"{' ' * margin} └{'─' * width}"
     scales = ", logarithmic" if scale is math.log10 else ""
-    return [*lines, axis, f"{' ' * margin}  {ends} episodes{scales}"]
+    drawn = [*lines, axis, f"{' ' * margin}  {ends} episodes{scales}"]
+    try:
+        "".join(drawn).encode(encoding)
+    except UnicodeEncodeError:
+        return ["".join(PLAIN.get(sign) or _star(sign) for sign in line) for line in drawn]
+    return drawn
+
+
+def _star(sign: str) -> str:
+    """A star for a character of the plot that has any dot."""
+    return sign if ord(sign) < BLANK else " *"[ord(sign) > BLANK]
 
 
 def _position(value: float, low: float, high: float, steps: int) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -111,7 +112,8 @@ def _print(record: CellRecord, folder: Path, headline: str, curve: list[dict[str
     unit = f" in {evaluation.unit}" if evaluation.unit else ""
     good = f"{evaluation.better} is better"
     say(f"{headline}{unit}, {counted(evaluation.episodes, 'noise-free episode')} ({good})")
-    for line in plot([row["episodes"] for row in curve], [row["value"] for row in curve]):
+    points = [row["episodes"] for row in curve], [row["value"] for row in curve]
+    for line in plot(*points, encoding=sys.stdout.encoding or "utf-8"):
         say(line)
     say()
 

@@ -49,8 +49,9 @@ class Need:
 def memory_needs(cell: Cell) -> list[Need]:
     """What a worker holds at one time, at least: a lower bound, made of the cell's settings.
 
-    Episodes of the last evaluation and of the first batch; of a local method a matrix over states
-    for each time step, and the weights of all pairs of time steps that posterior inference uses.
+    Episodes of the last evaluation and of the first batch; of a local method a minibatch's frames,
+    a matrix over states for each time step, and the weights of all pairs of time steps that
+    posterior inference uses.
     """
     task, method = cell.configuration.task, cell.configuration.method
     judged = cell.configuration.evaluation.episodes
@@ -64,6 +65,10 @@ def memory_needs(cell: Cell) -> list[Need]:
         prefix, states = f"methods.{cell.method}", method.representation.latent * seen.window
         batch, batches = max(method.batches.initial, method.batches.noisy), f"{prefix}.batches"
         needs.append(Need(batch * episode, "a batch of episodes", (batches, *sizes)))
+        training = method.training
+        drawn = training.segments * min(training.length, frames) * frame
+        longest = (f"{prefix}.training.segments", f"{prefix}.training.length", "task.observation")
+        needs.append(Need(drawn, "a minibatch of segments", longest))
         matrices = task.horizon * states**2 * FLOAT_BYTES
         latent = f"{prefix}.representation.latent"
         needs.append(Need(matrices, "dynamics of latent states", (latent, "task.horizon")))

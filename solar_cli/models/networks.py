@@ -22,6 +22,8 @@ from solar_cli.settings.networks import (
 
 Shape = tuple[int, ...]
 
+LARGEST_LAYER = 10**8
+"""Weights of a layer, and its outputs for one frame: a slip of the pen must not fill the memory."""
 LOG_SPEED = 5.0
 """Adam moves a parameter by at most its learning rate a step: too little for the log of a width,
 which has to change by whole units within a training. It is held divided by this."""
@@ -85,14 +87,33 @@ def build(layers: Sequence[Layer], shape: Shape, frame: Shape = ()) -> tuple[nn.
     modules: list[nn.Module] = []
     for number, layer in enumerate(layers, 1):
         try:
-            added, shape = _layer(layer, shape, frame)
+            _require_bounded("weights", _weights(layer, shape))
+            added, after = _layer(layer, shape, frame)
+            _require_bounded("outputs", math.prod(after))
         except (ValueError, ZeroDivisionError) as error:
             raise UsageError(
                 f"layer {number} ({layer.kind}) does not fit an input of shape {shape}: {error}; "
                 "correct the card's layer list"
             ) from error
         modules += added
+        shape = after
     return nn.Sequential(*modules), shape
+
+
+def _weights(layer: Layer, shape: Shape) -> int:
+    """Entries of the layer's matrix or filters for inputs of ``shape``."""
+    if isinstance(layer, Linear):
+        return math.prod(shape) * layer.width
+    if isinstance(layer, Conv):
+        return shape[0] // layer.groups * layer.channels * layer.size**2
+    if isinstance(layer, Deconv):
+        return shape[0] * layer.channels * layer.size**2
+    return shape[0] * 2 * layer.points if isinstance(layer, Bumps) else 0
+
+
+def _require_bounded(what: str, count: int) -> None:
+    if count > LARGEST_LAYER:
+        raise ValueError(f"it has {count} {what}, more than {LARGEST_LAYER}")
 
 
 def _layer(layer: Layer, shape: Shape, frame: Shape) -> tuple[list[nn.Module], Shape]:

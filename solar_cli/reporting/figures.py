@@ -32,6 +32,8 @@ DASHES: tuple[tuple[float, ...], ...] = ((), (5, 1.5), (1.5, 1.5), (6, 1.5, 1.5,
 """Up to four curves differ by more than their colour."""
 LEGEND_COLUMNS = 2
 """Below the axes, so that the figure stays readable at the width of a phone."""
+LONG_LABEL, LONGEST_LINE = 30, 64
+"""Characters from which on a label needs both columns, and that there is room for in them."""
 LOG_SPAN = 20.0
 """A measure whose best mean is this many times below its worst gets a logarithmic axis."""
 LOG_EPISODES = 20.0
@@ -74,7 +76,9 @@ def learning_curve(problem: Problem, theme: Theme = LIGHT) -> Figure:
     """The headline measure of every curve of a problem against episodes."""
     measure = problem.measure
     with mpl.rc_context(STYLE):
-        rows = -(-len(problem.curves) // LEGEND_COLUMNS)
+        lines = [line for curve in problem.curves for line in label(curve).splitlines()]
+        columns = LEGEND_COLUMNS if max(map(len, lines)) <= LONG_LABEL else 1
+        rows = -(-len(problem.curves) // columns)
         figure = Figure(figsize=(5.6, 3.8 + 0.35 * rows), layout="constrained")
         axes = figure.add_subplot()
         for index, curve in enumerate(problem.curves):
@@ -90,7 +94,7 @@ def learning_curve(problem: Problem, theme: Theme = LIGHT) -> Figure:
         )
         figure.legend(
             loc="outside lower center",
-            ncols=min(LEGEND_COLUMNS, len(problem.curves)),
+            ncols=min(columns, len(problem.curves)),
             frameon=False,
             labelcolor=theme.ink,
         )
@@ -136,7 +140,7 @@ def label(curve: Curve) -> str:
     diverged = sum(seed.diverged for seed in curve.seeds)
     failed = curve.count(State.FAILED)
     unfinished = curve.count(State.PENDING, State.RUNNING, State.INTERRUPTED)
-    lines = [f"{curve.label}, {counted(count, 'seed')}"]
+    lines = textwrap.wrap(f"{curve.label}, {counted(count, 'seed')}", LONGEST_LINE)
     lines += [f"{diverged} diverged (×)"] * bool(diverged)
     lines += [f"{failed} failed (+)"] * bool(failed)
     lines += [f"{unfinished} unfinished"] * bool(unfinished)

@@ -35,6 +35,7 @@ def test_a_task_that_does_not_hold_is_refused(
         ("task.horizon=1000000", "task.horizon"),
         ("evaluation.episodes=1000000", "evaluation.episodes"),
         ("methods.solar.batches.initial=1000000", "methods.solar.batches"),
+        ("methods.solar.training.segments=10000000", "methods.solar.training.segments"),
     ],
 )
 def test_what_cannot_fit_into_the_machine_is_refused_before_it_starts(

@@ -83,3 +83,12 @@ def test_what_is_not_finite_leaves_a_gap() -> None:
 
 def test_a_single_point_is_drawn() -> None:
     assert len(dots(plot([5], [2.0], width=4, height=2))) == 1
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
+def test_a_terminal_without_braille_gets_stars_in_the_same_places(encoding: str) -> None:
+    points = [0, 5, 10], [1.0, 0.2, 0.5]
+    plain, drawn = plot(*points, encoding=encoding), plot(*points)
+    assert "?" not in "".join(plain).encode(encoding, "replace").decode(encoding)
+    for star, dotted in zip(plain[:12], drawn[:12], strict=True):
+        assert [sign == "*" for sign in star] == [sign > "\u2800" for sign in dotted]

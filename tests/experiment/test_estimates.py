@@ -77,9 +77,10 @@ def test_what_is_held_in_memory_is_foreseen() -> None:
     evaluated = Judge(cell).evaluate(Still(), 0).episodes
     parts = (evaluated.frames, evaluated.actions, evaluated.action_means, evaluated.costs)
     held = sum(part.nbytes for part in parts)
-    evaluation, batch, dynamics, weights = memory_needs(cell)
+    evaluation, batch, minibatch, dynamics, weights = memory_needs(cell)
     assert evaluation.bytes == held
     assert batch.bytes == held / 5 * 80  # the card's first batch
+    assert minibatch.bytes == evaluated.frames[:1, :4].nbytes * 30  # the card's segments
     assert dynamics.bytes == np.zeros((7, 4 * 2, 4 * 2)).nbytes  # d = 4, two frames a window
     assert weights.bytes == np.zeros((7, 7)).nbytes
 

@@ -271,6 +271,18 @@ def test_the_networks_of_the_card_fit_its_frames(variant):
             (2, 8, 8),
             r"layer 2 \(spatial_softmax\).*\(8,\)",
         ),
+        (
+            [{"kind": "conv", "channels": 10**6, "size": 8}],
+            (2, 8, 8),
+            r"layer 1.*128000000 weights",
+        ),
+        ([{"kind": "deconv", "channels": 10**6, "size": 8}], (2,), r"layer 1.*128000000 weights"),
+        ([{"kind": "linear", "width": 10**60}], (2, 8, 8), r"layer 1 \(linear\).* weights"),
+        (
+            [{"kind": "conv", "channels": 1, "size": 1, "padding": 10**4}],
+            (1, 8, 8),
+            r"layer 1.* outputs",
+        ),
         ([{"kind": "bumps", "points": 2}], (2, 8, 8), r"layer 1 \(bumps\)"),
         ([{"kind": "bumps", "points": 2}], (8,), r"layer 1 \(bumps\).*images"),
     ],

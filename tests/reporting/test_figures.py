@@ -43,6 +43,17 @@ def test_the_legend_counts_seeds_and_everything_that_went_wrong():
     ]
 
 
+@pytest.mark.parametrize("length", [4, 20, 40, 60])  # of a variant's name, which may have 60
+def test_the_legend_lies_inside_the_figure(length):
+    variant = ("training.learning_rate-0.001_" * 3)[:length]
+    names = [f"solar:{variant}", f"vae:{variant}"]
+    figure = learning_curve(problem(*(flat_curve(name, [0.1, 0.2]) for name in names)))
+    [legend] = figure.legends
+    shown, whole = legend.get_window_extent(), figure.bbox
+    assert whole.x0 <= shown.x0 < shown.x1 <= whole.x1
+    assert whole.y0 <= shown.y0 < shown.y1 <= whole.y1
+
+
 def test_a_diverged_seed_is_marked_where_it_stopped_and_held_to_the_end():
     lines = axes_of(curve(seed(0, STEADY), seed(1, STEADY[:2], State.DIVERGED))).lines
     (mark,) = [line for line in lines if line.get_marker() == "x"]
