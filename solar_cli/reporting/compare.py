@@ -195,8 +195,18 @@ def compare_curves(problem: Problem, left: Curve, right: Curve, said: list[str])
         p=p,
         verdict=verdict,
         why=why,
-        notes=tuple(said),
+        notes=(*said, *_unequal(left, right)),
     )
+
+
+def _unequal(left: Curve, right: Curve) -> list[str]:
+    """What to know where one side has had more episodes than the other."""
+    if left.end == right.end:
+        return []
+    return [
+        f"{left.label} ends at {counted(left.end, 'episode')}, {right.label} at {right.end}: their "
+        "final values are of unequal budgets; `solar run --budget N` goes on with the shorter"
+    ]
 
 
 def _side(curve: Curve) -> Side:

@@ -52,6 +52,13 @@ def test_a_verdict_needs_a_test_that_can_reach_its_level(better, p, seeds, verdi
     assert judge(better, p, *seeds)[0] == verdict
 
 
+def test_ends_at_unequal_episodes_are_told():
+    short, long = flat_curve("vae", NEAR, 80), flat_curve("solar", FAR, 100)
+    [note] = compare_curves(problem(short, long), short, long, []).notes
+    assert "vae ends at 80 episodes, solar at 100" in note
+    assert pair(NEAR, FAR).notes == ()
+
+
 def test_too_few_seeds_are_named_as_the_reason():
     assert "cannot reach" in pair(FAR[:3], NEAR[:3]).why
 
