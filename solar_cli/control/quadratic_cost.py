@@ -2,15 +2,19 @@
 
 The action's part is known; L, c and b minimise the squared error of observed costs. L has a
 positive diagonal, so that C = L L^T is positive definite. Fits run in whitened latents and
-standardised costs, where one optimiser setting serves every task.
+standardised costs, where one optimiser setting serves every task. A quadratic of 16 latents has 153
+coefficients, more than a few episodes tell: how much older batches count, how large coefficients
+may be, and whether each time step has its own, is chosen by held-out R2.
 
 Axes: N episodes, T horizon, n samples of a fit, m features of z, q monomials of them. The leading
-axis k is of fits that are made at once: T, or none.
+axes k are of fits that are made at once.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import reduce
+from itertools import product
 from typing import NamedTuple
 
 import torch
@@ -24,7 +28,8 @@ from solar_cli.settings.local import CostFit
 LBFGS_ROUNDS = 100
 SGD_STEPS = 1000
 SGD_RATE = 1e-2
-PULL = 1e-3  # of a fit per time step towards the global one, on standardised costs
+PULL = 1e-3  # of a fit per time step towards the shared one, on standardised costs
+FOLDS = 4
 
 
 class _Quadratic(NamedTuple):
@@ -47,9 +52,12 @@ class _Quadratic(NamedTuple):
         halves = torch.where(pairs[0] == pairs[1], 0.5, 1.0).to(C)
         return torch.cat([halves * C[..., *pairs], self.c, self.b.unsqueeze(-1)], dim=-1)
 
-    def value(self, z: Float[Tensor, "*k n m"]) -> Float[Tensor, "*k n"]:
-        """The quadratic form at every sample."""
-        return (_monomials(z) @ self.coefficients().unsqueeze(-1)).squeeze(-1)
+    def size(self) -> Float[Tensor, "*k"]:
+        """Squares of the curvatures and slopes."""
+        cholesky = self.cholesky()
+        curvature = (cholesky @ cholesky.mT).square().sum(dim=(-2, -1))
+        slope: Tensor = self.c.square().sum(dim=-1)
+        return 0.5 * curvature + slope
 
 
 def _monomials(z: Float[Tensor, "*k n m"]) -> Float[Tensor, "*k n q"]:
@@ -59,19 +67,54 @@ def _monomials(z: Float[Tensor, "*k n m"]) -> Float[Tensor, "*k n q"]:
 
 
 class _Moments(NamedTuple):
-    """Means over the samples of one or several fits: all that a squared error needs of them."""
+    """Sums over the samples of one or several fits: all that a squared error needs of them."""
 
     xx: Float[Tensor, "*k q q"]
     xy: Float[Tensor, "*k q"]
     yy: Float[Tensor, "*k"]
+    n: Float[Tensor, "*k"]
+    """samples"""
 
     def error(self, quadratic: _Quadratic) -> Float[Tensor, "*k"]:
-        """Mean squared error."""
+        """Sum of squared errors."""
         w = quadratic.coefficients()
         explained: Tensor = (w * (torch.einsum("...ij,...j->...i", self.xx, w) - 2 * self.xy)).sum(
             dim=-1
         )
         return explained + self.yy
+
+    def each(self, change: Callable[[Tensor], Tensor]) -> _Moments:
+        """The same done to all of them."""
+        return _Moments(*(change(part) for part in self))
+
+    def over_time(self) -> _Moments:
+        """All time steps, the last axis, together."""
+        axis = self.n.ndim - 1
+        return self.each(lambda part: part.sum(dim=axis))
+
+    def plus(self, other: _Moments) -> _Moments:
+        """Of the samples of both."""
+        return _Moments(*(a + b for a, b in zip(self, other, strict=True)))
+
+    def minus(self, other: _Moments) -> _Moments:
+        """Without the samples of the other."""
+        return _Moments(*(a - b for a, b in zip(self, other, strict=True)))
+
+    def mean(self) -> _Moments:
+        """Means over samples; zero where there are none."""
+        n = self.n.clamp_min(1e-9)
+        return _Moments(self.xx / n[..., None, None], self.xy / n[..., None], self.yy / n, self.n)
+
+
+class Choice(NamedTuple):
+    """What held-out R2 decides."""
+
+    older: float
+    """weight of older samples"""
+    ridge: float
+    """weight of squared coefficients"""
+    per_time: bool
+    """whether a fit per time step won"""
 
 
 class FittedCost(NamedTuple):
@@ -80,41 +123,74 @@ class FittedCost(NamedTuple):
     model: QuadraticCost
     r2: float
     """share of the variance of held-out costs that is explained"""
-    per_time: bool
-    """whether a fit per time step won"""
+    choice: Choice
+
+    @property
+    def metrics(self) -> dict[str, float]:
+        """To be stored."""
+        chosen = {f"cost_{name}": float(value) for name, value in self.choice._asdict().items()}
+        return {"cost_r2": self.r2, **chosen}
 
 
 def fit_quadratic_cost(
-    states: Trajectories, action_cost: float, settings: CostFit, features: int
+    states: Trajectories,
+    older: Sequence[Trajectories],
+    action_cost: float,
+    settings: CostFit,
+    features: int,
 ) -> FittedCost:
     """Fit on the first ``features`` entries of z: one fit for all time steps, and one per time
     step where held-out R2 says that it is better.
 
-    The cost of the last state, which is never observed, is the last fit's times
-    ``settings.terminal``.
+    ``older`` batches may support the shared fit. The cost of the last state, which is never
+    observed, is the last fit's times ``settings.terminal``.
     """
-    z, live = states.z[:, :-1, :features], states.live
     y = states.costs - action_cost * states.actions.square().sum(dim=-1)
-    mean, scale = y[live].mean(), y[live].std().clamp_min(1e-9)
-    target = (y - mean) / scale
-    held_out = torch.arange(len(z)) % 5 == 4
-    if len(z) < 5:
-        held_out = torch.arange(len(z)) == len(z) - 1
-    fit, judge = ~held_out, held_out
-    shared = _fit_shared(z[fit], target[fit], live[fit], settings)
-    judged, observed = live[judge], target[judge][live[judge]]
-    r2 = _r2(shared.value(z[judge][judged]), observed)
-    per_time = False
-    if settings.per_time == "chosen":
-        each = _fit_each(z[fit], target[fit], live[fit], shared, settings)
-        predicted = each.value(z[judge].transpose(0, 1)).transpose(0, 1)
-        each_r2 = _r2(predicted[judged], observed)
-        per_time, r2 = each_r2 > r2, max(r2, each_r2)
-    best = _fit_shared(z, target, live, settings)
-    if per_time:
-        best = _fit_each(z, target, live, best, settings)
-    model = _assembled(best, states, action_cost, mean, scale, settings.terminal)
-    return FittedCost(model, r2, per_time)
+    mean, scale = y[states.live].mean(), y[states.live].std().clamp_min(1e-9)
+    fold = torch.arange(len(y)) % min(FOLDS, len(y))
+
+    def moments(batch: Trajectories) -> _Moments:
+        y = batch.costs - action_cost * batch.actions.square().sum(dim=-1)
+        return _moments(batch.z[:, :-1, :features], (y - mean) / scale, batch.live)
+
+    whole = moments(states)
+    folds = [
+        moments(Trajectories(*(part[fold == k] for part in states)))
+        for k in range(int(fold.max()) + 1)
+    ]
+    past = [moments(batch).over_time() for batch in older]
+    support = reduce(_Moments.plus, past) if past else None
+    scores = _held_out(_Moments(*map(torch.stack, zip(*folds, strict=True))), support, settings)
+    best = max(scores, key=lambda choice: scores[choice])
+    fit = _fit(whole, support, [best], settings)
+    fit = _Quadratic(*(part.squeeze(0) for part in fit))
+    model = _assembled(fit, states, action_cost, mean, scale, settings.terminal)
+    return FittedCost(model, scores[best], best)
+
+
+def _held_out(folds: _Moments, support: _Moments | None, settings: CostFit) -> dict[Choice, float]:
+    """R2 of every choice on the episodes that a fit was not given; axes (folds, T).
+
+    Whether fits per time step are better is asked of the best shared one only.
+    """
+    whole = folds.each(lambda part: part.sum(dim=0, keepdim=True))
+    learned = whole.minus(folds) if len(folds.n) > 1 else whole
+    spread = float(whole.yy.sum())
+    varies = spread > 1e-12 * float(whole.n.sum())
+
+    def r2(choices: list[Choice]) -> dict[Choice, float]:
+        if not varies:  # nothing to explain
+            return dict.fromkeys(choices, 1.0)
+        error = folds.error(_fit(learned, support, choices, settings)).sum(dim=(1, 2))
+        return dict(zip(choices, (1 - error / spread).tolist(), strict=True))
+
+    weights = settings.older if support is not None else (0.0,)
+    shared = [Choice(w, ridge, per_time=False) for w, ridge in product(weights, settings.ridge)]
+    scores = r2(shared)
+    best = max(scores, key=lambda choice: scores[choice])
+    if settings.per_time == "never":
+        return scores
+    return {**scores, **r2([best._replace(per_time=True)])}
 
 
 def explained(model: QuadraticCost, states: Trajectories) -> float:
@@ -135,56 +211,69 @@ def _r2(predicted: Tensor, observed: Tensor) -> float:
 def _moments(
     z: Float[Tensor, "N T m"], target: Float[Tensor, "N T"], live: Bool[Tensor, "N T"]
 ) -> _Moments:
-    """Sums over the episodes that were still running, over N, for every time step."""
-    over, count = ~live.T, len(z)
+    """Of every time step, over the episodes that were still running."""
+    over = ~live.T
     x = _monomials(z.transpose(0, 1)).masked_fill(over.unsqueeze(-1), 0.0)
     y = target.T.masked_fill(over, 0.0)
     xy = (x.mT @ y.unsqueeze(-1)).squeeze(-1)
-    return _Moments(x.mT @ x / count, xy / count, y.square().mean(dim=1))
+    return _Moments(x.mT @ x, xy, y.square().sum(dim=1), live.sum(dim=0).to(y))
 
 
-def _fit_shared(
-    z: Float[Tensor, "N T m"],
-    target: Float[Tensor, "N T"],
-    live: Bool[Tensor, "N T"],
-    settings: CostFit,
+def _fit(
+    moments: _Moments, support: _Moments | None, choices: list[Choice], settings: CostFit
 ) -> _Quadratic:
-    m = z.shape[-1]
+    """Parameters (choices, *axes of the moments), the last of which are time steps.
+
+    ``support`` are moments of older batches. Choices are either all per time step or all not.
+    """
+    axes = (1,) * (moments.n.ndim - 1)
+    older, ridge = moments.n.new_tensor([choice[:2] for choice in choices]).T.view(2, -1, *axes)
+    count = len(choices)
+    everything = moments.over_time().each(lambda part: part.expand(count, *part.shape))
+    if support is not None:
+        everything = everything.plus(support.each(lambda part: _times(older, part)))
+    shared = _fit_shared(everything.mean(), ridge, settings)
+    if choices[0].per_time:
+        return _fit_each(moments, shared, settings)
+    return _Quadratic(*(part.unsqueeze(len(axes) + 1) for part in shared))
+
+
+def _times(weight: Float[Tensor, "*k"], part: Float[Tensor, "*q"]) -> Float[Tensor, "*k *q"]:
+    return weight.view(*weight.shape, *(1,) * part.ndim) * part
+
+
+def _fit_shared(moments: _Moments, ridge: Float[Tensor, "*#k"], settings: CostFit) -> _Quadratic:
+    """One fit for each of the leading axes."""
+    q, axes = moments.xy.shape[-1], moments.n.shape
+    m = round((2 * q + 0.25) ** 0.5 - 1.5)  # q = m (m + 1) / 2 + m + 1
     start = _Quadratic(
-        torch.zeros(m, m, dtype=z.dtype, device=z.device) - torch.eye(m, device=z.device),
-        torch.zeros(m, dtype=z.dtype, device=z.device),
-        torch.zeros((), dtype=z.dtype, device=z.device),
+        -torch.eye(m).to(moments.xy).repeat(*axes, 1, 1),
+        moments.xy.new_zeros(*axes, m),
+        moments.xy.new_zeros(axes),
     )
-    share = live.to(z).mean()
-    moments = _Moments(*(part.mean(dim=0) / share for part in _moments(z, target, live)))
-    return _minimise(start, moments.error, settings)
+    return _minimise(start, lambda w: (moments.error(w) + ridge * w.size()).sum(), settings)
 
 
-def _fit_each(
-    z: Float[Tensor, "N T m"],
-    target: Float[Tensor, "N T"],
-    live: Bool[Tensor, "N T"],
-    shared: _Quadratic,
-    settings: CostFit,
-) -> _Quadratic:
+def _fit_each(moments: _Moments, shared: _Quadratic, settings: CostFit) -> _Quadratic:
     """One fit a time step; samples of neighbouring steps count with a Gaussian weight.
 
-    A time step far from all samples gets the shared fit.
+    A time step far from all samples gets the shared fit. Axes of the moments: (*k, T).
     """
-    horizon = z.shape[1]
-    times = torch.arange(horizon, device=z.device)
+    times = torch.arange(moments.n.shape[-1], device=moments.n.device)
     distance = (times[:, None] - times).abs()
     reach = max(1, round(2 * settings.width))
     weight = torch.exp(-0.5 * (distance / settings.width).square()) * (distance <= reach)
-    total = (weight * live.to(weight).mean(dim=0)).sum(dim=1, keepdim=True)
-    weight = (weight / torch.where(total > 0, total, 1.0)).to(z.dtype)
-    own = _moments(z, target, live)
-    moments = _Moments(*(torch.einsum("ts,s...->t...", weight, part) for part in own))
-    start = _Quadratic(*(part.expand(horizon, *part.shape).clone() for part in shared))
+    weight = weight.to(moments.xx)
+    axis = moments.n.ndim - 1
+    own = moments.each(
+        lambda part: torch.tensordot(weight, part, dims=([1], [axis])).movedim(0, axis)
+    ).mean()
+    centre = _Quadratic(*(part.unsqueeze(axis + 1) for part in shared))
+    start = _Quadratic(*(part.repeat_interleave(len(times), dim=axis + 1) for part in centre))
 
-    def objective(q: _Quadratic) -> Tensor:
-        pull = sum((a - b).square().sum() for a, b in zip(q, shared, strict=True))
-        return moments.error(q).sum() + PULL * pull
+    def objective(w: _Quadratic) -> Tensor:
+        away = sum((a - b).square().sum() for a, b in zip(w, centre, strict=True))
+        return own.error(w).sum() + PULL * away
 
     return _minimise(start, objective, settings)
 

@@ -183,13 +183,13 @@ class Privileged(LocalLearner):
         plain = self.settings.local_fit.model_copy(update={"method": "regression"})
         return infer_dynamics(self._rollouts, [], prior, plain, streams)
 
-    def fitted_cost(self, states: Trajectories) -> FittedCost:
+    def fitted_cost(self, states: Trajectories, older: list[Trajectories]) -> FittedCost:
         """Of the rollouts, or as the method, which judges representations by it before there are
         any."""
         if Part.COST not in self.given or self._rollouts is None:
-            return super().fitted_cost(states)
+            return super().fitted_cost(states, older)
         settings = CostFit(width=OWN_STEP, terminal=self.settings.cost_fit.terminal)
-        return fit_quadratic_cost(self._rollouts, self.task.action_cost, settings, self.latent)
+        return fit_quadratic_cost(self._rollouts, [], self.task.action_cost, settings, self.latent)
 
     def _rolled_out(self, iteration: int) -> Trajectories:
         """The policy that collected that iteration, batch by batch: frames fill the memory."""

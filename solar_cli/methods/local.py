@@ -166,10 +166,10 @@ class LocalLearner(ABC):
         """Line 7: local dynamics around the newest latents."""
         return infer_dynamics(states, older, prior, self.settings.local_fit, streams)
 
-    def fitted_cost(self, states: Trajectories) -> FittedCost:
+    def fitted_cost(self, states: Trajectories, older: list[Trajectories]) -> FittedCost:
         """The quadratic cost of the newest latents (section 3)."""
         return fit_quadratic_cost(
-            states, self.task.action_cost, self.settings.cost_fit, self.latent
+            states, older, self.task.action_cost, self.settings.cost_fit, self.latent
         )
 
     def adopt(
@@ -239,4 +239,4 @@ class LocalLearner(ABC):
         fit, judge = (
             Trajectories.of(representation.embed(part).cpu(), part) for part in (learned, held_out)
         )
-        return explained(self.fitted_cost(fit).model, judge)
+        return explained(self.fitted_cost(fit, []).model, judge)

@@ -39,7 +39,7 @@ class Solar(LocalLearner):
             self.latent_prior(older),
             self.streams.under("local dynamics", experience.iteration),
         )
-        cost = self.fitted_cost(states)  # the quadratic cost of section 3
+        cost = self.fitted_cost(states, older_states)  # the quadratic cost of section 3
         bound = self.max_kl(region, len(dynamics.model.F))
         update = improve_policy(  # line 8: POLICYUPDATE, section 4.2 and appendix A
             previous.policy, dynamics.model, cost.model, bound, self.std_bounds()
@@ -48,8 +48,7 @@ class Solar(LocalLearner):
         return {
             **model,
             **dynamics.metrics,
-            "cost_r2": cost.r2,
-            "cost_per_time": float(cost.per_time),
+            **cost.metrics,
             "linearisation_residual": previous.residual,
             **self.adopt(region, previous.policy, promised, update, states.reached),
         }

@@ -16,6 +16,8 @@ from solar_cli.settings.networks import (
     Deconv,
     Layer,
     Linear,
+    Maps,
+    Shuffle,
     SpatialSoftmax,
     Unshuffle,
 )
@@ -50,32 +52,55 @@ class SpatialSoftmaxLayer(nn.Module):
         return (share @ self.places).mT.flatten(1)
 
 
-class BumpsLayer(nn.Module):
-    """A frame as a sum of Gaussian bumps at coordinates that are linear in the input."""
+class _Points(nn.Module):
+    """Gaussian bumps at coordinates (x, y) in [-1, 1] that are linear in the input."""
 
     columns: Tensor
     rows: Tensor
 
-    def __init__(self, inputs: int, points: int, frame: Shape, width: float) -> None:
+    def __init__(self, inputs: int, points: int, sides: Shape, width: float) -> None:
         super().__init__()
-        channels, height, columns = frame
+        height, columns = sides
         self.place = nn.Linear(inputs, 2 * points)
         nn.init.uniform_(self.place.bias, -0.5, 0.5)
         self.log_width = nn.Parameter(torch.full((points,), math.log(width) / LOG_SPEED))
-        self.colour = nn.Parameter(torch.randn(channels, points) / math.sqrt(points))
-        self.ground = nn.Parameter(torch.zeros(channels, 1, 1))
         self.register_buffer("columns", torch.linspace(-1, 1, columns), persistent=False)
         self.register_buffer("rows", torch.linspace(1, -1, height), persistent=False)
 
-    def forward(self, inputs: Float[Tensor, "n m"]) -> Float[Tensor, "n c h w"]:
-        """Sum over points of colour x down x across: bumps are separable, maps are never made."""
+    def bumps(
+        self, inputs: Float[Tensor, "n m"]
+    ) -> tuple[Float[Tensor, "n points h"], Float[Tensor, "n points w"]]:
+        """Down and across: a bump is their outer product."""
         x, y = self.place(inputs).chunk(2, dim=-1)
         scale = (-LOG_SPEED * self.log_width).exp()[:, None]
         across = (-0.5 * ((self.columns - x.unsqueeze(-1)) * scale).square()).exp()
         down = (-0.5 * ((self.rows - y.unsqueeze(-1)) * scale).square()).exp()
+        return down, across
+
+
+class BumpsLayer(_Points):
+    """A frame as a coloured sum of the bumps."""
+
+    def __init__(self, inputs: int, points: int, frame: Shape, width: float) -> None:
+        super().__init__(inputs, points, frame[1:], width)
+        self.colour = nn.Parameter(torch.randn(frame[0], points) / math.sqrt(points))
+        self.ground = nn.Parameter(torch.zeros(frame[0], 1, 1))
+
+    def forward(self, inputs: Float[Tensor, "n m"]) -> Float[Tensor, "n c h w"]:
+        """Sum over points of colour x down x across: the maps of single bumps are never made."""
+        down, across = self.bumps(inputs)
         painted = self.colour[:, :, None] * down.unsqueeze(1)
         frame: Tensor = painted.mT @ across.unsqueeze(1) + self.ground
         return frame
+
+
+class MapsLayer(_Points):
+    """A map for each of the bumps."""
+
+    def forward(self, inputs: Float[Tensor, "n m"]) -> Float[Tensor, "n points h w"]:
+        """Down x across."""
+        down, across = self.bumps(inputs)
+        return down.unsqueeze(-1) * across.unsqueeze(-2)
 
 
 def build(layers: Sequence[Layer], shape: Shape, frame: Shape = ()) -> tuple[nn.Sequential, Shape]:
@@ -108,7 +133,7 @@ def _weights(layer: Layer, shape: Shape) -> int:
         return shape[0] // layer.groups * layer.channels * layer.size**2
     if isinstance(layer, Deconv):
         return shape[0] * layer.channels * layer.size**2
-    return shape[0] * 2 * layer.points if isinstance(layer, Bumps) else 0
+    return shape[0] * 2 * layer.points if isinstance(layer, Bumps | Maps) else 0
 
 
 def _require_bounded(what: str, count: int) -> None:
@@ -126,6 +151,11 @@ def _layer(layer: Layer, shape: Shape, frame: Shape) -> tuple[list[nn.Module], S
         if len(shape) != 1 or len(frame) != 3:
             raise ValueError("it needs a vector, and images to draw")
         return [BumpsLayer(shape[0], layer.points, frame, layer.width)], frame
+    if isinstance(layer, Maps):
+        if len(shape) != 1 or len(frame) != 3:
+            raise ValueError("it needs a vector, and images to draw")
+        sides = _divided(frame[1:], layer.factor)
+        return [MapsLayer(shape[0], layer.points, sides, layer.width)], (layer.points, *sides)
     if isinstance(layer, Deconv) and len(shape) == 1:
         shape = (shape[0], 1, 1)
         added, shape = _image_layer(layer, shape)
@@ -138,34 +168,39 @@ def _layer(layer: Layer, shape: Shape, frame: Shape) -> tuple[list[nn.Module], S
 def _image_layer(layer: Layer, shape: Shape) -> tuple[list[nn.Module], Shape]:
     channels, height, width = shape
     if isinstance(layer, Unshuffle):
-        factor = layer.factor
-        if height % factor or width % factor:
-            raise ValueError(f"sides are no multiples of {factor}")
-        return [nn.PixelUnshuffle(factor)], (
-            channels * factor**2,
-            height // factor,
-            width // factor,
-        )
+        sides = _divided((height, width), layer.factor)
+        return [nn.PixelUnshuffle(layer.factor)], (channels * layer.factor**2, *sides)
+    if isinstance(layer, Shuffle):
+        if channels % layer.factor**2:
+            raise ValueError(f"channels are no multiple of {layer.factor**2}")
+        sides = (height * layer.factor, width * layer.factor)
+        return [nn.PixelShuffle(layer.factor)], (channels // layer.factor**2, *sides)
     if isinstance(layer, SpatialSoftmax):
         return [SpatialSoftmaxLayer(height, width, layer.log_sharpness)], (2 * channels,)
     if isinstance(layer, Deconv):
         deconv = nn.ConvTranspose2d(channels, layer.channels, layer.size, layer.stride)
-        sides = [(side - 1) * layer.stride + layer.size for side in (height, width)]
-        return [deconv, *_activation(layer.activation)], (layer.channels, *sides)
+        larger = [(side - 1) * layer.stride + layer.size for side in (height, width)]
+        return [deconv, *_activation(layer.activation)], (layer.channels, *larger)
     assert isinstance(layer, Conv)
     if channels % layer.groups or layer.channels % layer.groups:
         raise ValueError(f"channels are no multiples of {layer.groups} groups")
-    sides = [
+    after = [
         ((side + 2 * layer.padding - layer.size) // layer.stride + 1) // layer.pool
         for side in (height, width)
     ]
-    if min(sides) < 1:
+    if min(after) < 1:
         raise ValueError("nothing is left of the image")
     conv = nn.Conv2d(
         channels, layer.channels, layer.size, layer.stride, layer.padding, groups=layer.groups
     )
     pool = [nn.MaxPool2d(layer.pool)] if layer.pool > 1 else []
-    return [conv, *_activation(layer.activation), *pool], (layer.channels, *sides)
+    return [conv, *_activation(layer.activation), *pool], (layer.channels, *after)
+
+
+def _divided(sides: Shape, factor: int) -> Shape:
+    if any(side % factor for side in sides):
+        raise ValueError(f"sides are no multiples of {factor}")
+    return tuple(side // factor for side in sides)
 
 
 def _activation(name: str) -> list[nn.Module]:

@@ -133,6 +133,18 @@ class CostFit(Settings):
     optimiser: Literal["lbfgs", "sgd"] = setting(
         "lbfgs", "of the squared error; sgd is full-batch descent with momentum"
     )
+    ridge: tuple[float, ...] = setting(
+        (0.0, 0.03, 0.3),
+        "weight of squared coefficients, in standardised units, chosen by held-out R2",
+        min_length=1,
+        added=[0.0],
+    )
+    older: tuple[float, ...] = setting(
+        (0.0, 1.0),
+        "weight of samples of older batches, chosen by held-out R2",
+        min_length=1,
+        added=[0.0],
+    )
     width: float = setting(5.0, "reach in time steps of a per-time fit", gt=0)
     per_time: Literal["chosen", "never"] = setting(
         "chosen", "a fit per time step where held-out R2 says so, or never"

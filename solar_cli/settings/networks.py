@@ -16,6 +16,13 @@ class Unshuffle(Settings):
     factor: int = setting(..., "side of the blocks that become channels", ge=1)
 
 
+class Shuffle(Settings):
+    """Depth to space, the inverse of unshuffle: (C f^2, H, W) -> (C, H f, W f)."""
+
+    kind: Literal["shuffle"] = "shuffle"
+    factor: int = setting(..., "side of the blocks that channels become", ge=1)
+
+
 class Conv(Settings):
     """A convolution without padding tricks: output side = (side + 2 padding - size)/stride + 1."""
 
@@ -68,8 +75,20 @@ class Bumps(Settings):
     width: float = setting(0.3, "initial std of a bump; the image is 2 wide", gt=0)
 
 
+class Maps(Settings):
+    """One map for each of some points, a Gaussian bump at coordinates that are linear in the input.
+
+    The spatial softmax read backwards: convolutions that follow draw what stands at the points.
+    """
+
+    kind: Literal["maps"] = "maps"
+    points: int = setting(..., "maps, each with a bump of a learned width", ge=1)
+    factor: int = setting(..., "how many times larger than the maps the frame's sides are", ge=1)
+    width: float = setting(0.15, "initial std of a bump; a map is 2 wide", gt=0)
+
+
 Layer = Annotated[
-    Unshuffle | Conv | SpatialSoftmax | Linear | Deconv | Bumps,
+    Unshuffle | Shuffle | Conv | SpatialSoftmax | Linear | Deconv | Bumps | Maps,
     Field(discriminator="kind"),
 ]
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from solar_cli.control.quadratic_cost import explained, fit_quadratic_cost
+from solar_cli.control.quadratic_cost import FOLDS, explained, fit_quadratic_cost
 from solar_cli.control.trajectories import Trajectories
 from solar_cli.settings.local import CostFit
 
@@ -30,8 +30,26 @@ def quadratic(z, t=0, C=C, c=c, b=b):
     return 0.5 * np.einsum("ni,ij,nj->n", z, C, z) + z @ c + b
 
 
-def fit(states, features=m, alpha=ALPHA, **settings):
-    return fit_quadratic_cost(states, alpha, CostFit.model_validate(settings), features)
+def fit(states, features=m, alpha=ALPHA, older=(), **settings):
+    return fit_quadratic_cost(states, older, alpha, CostFit.model_validate(settings), features)
+
+
+def monomials(states):
+    """(N, T, q): z_i z_j for j <= i, z, 1."""
+    z = states.z[:, :-1].numpy()
+    i, j = np.tril_indices(z.shape[-1])
+    return np.concatenate([z[..., i] * z[..., j], z, np.ones((*z.shape[:2], 1))], axis=-1)
+
+
+def rows(design):
+    return design.reshape(-1, design.shape[-1])
+
+
+def curvature(w):
+    """C of the weights of monomials."""
+    half = np.zeros((m, m))
+    half[np.tril_indices(m)] = w[: m * (m + 1) // 2]
+    return half + half.T
 
 
 def predicted(model, states):
@@ -140,17 +158,20 @@ def test_a_saddle_is_fitted_no_worse_than_by_its_mean():
 
 
 def test_r2_is_that_of_episodes_left_out():
-    """Every fifth episode judges: noise there, and nowhere else, is what cannot be explained."""
-    states = batch(quadratic)
-    judge = np.arange(N) % 5 == 4
-    noise = np.where(judge[:, None], np.random.default_rng(3).normal(size=(N, T)), 0.0)
-    noisy = states._replace(costs=states.costs + torch.as_tensor(3.0 * noise))
-    known = noisy.costs.numpy() - ALPHA * np.square(noisy.actions.numpy()).sum(axis=-1)
-    truth = np.stack([quadratic(states.z[:, t].numpy()) for t in range(T)], axis=1)[judge]
-    known = known[judge]
-    expected = 1 - np.square(known - truth).sum() / np.square(known - known.mean()).sum()
-    assert 0.1 < expected < 0.6
-    assert fit(noisy, per_time="never").r2 == pytest.approx(expected, abs=0.01)
+    """Each fold against ridge regression on the others, whose Hessian here is positive definite."""
+    states = batch(quadratic, noise=2.0)
+    known = states.costs.numpy() - ALPHA * np.square(states.actions.numpy()).sum(axis=-1)
+    design = monomials(states)
+    fold = np.arange(N) % FOLDS
+    squared = 0.0
+    for k in range(FOLDS):
+        learned, judge = fold != k, fold == k
+        w = np.linalg.lstsq(rows(design[learned]), known[learned].ravel(), rcond=None)[0]
+        assert np.linalg.eigvalsh(curvature(w)).min() > 0.05
+        squared += np.square(rows(design[judge]) @ w - known[judge].ravel()).sum()
+    expected = 1 - squared / np.square(known - known.mean()).sum()
+    assert 0.1 < expected < 0.8
+    assert fit(states, per_time="never", ridge=(0.0,)).r2 == pytest.approx(expected, abs=0.01)
 
 
 def test_r2_on_other_episodes_is_that_of_the_models_predictions():
@@ -167,7 +188,7 @@ def varying(z, t):
 def test_a_cost_that_varies_is_fitted_per_time_step():
     states = batch(varying, episodes=80)
     each = fit(states, width=0.3)
-    assert each.per_time
+    assert each.choice.per_time
     assert each.r2 > 0.98
     assert each.r2 > fit(states, per_time="never").r2 + 0.1
     assert r2(each.model, batch(varying, seed=1)) > 0.98
@@ -177,14 +198,14 @@ def test_a_cost_that_does_not_vary_is_fitted_once():
     """Few noisy episodes: a fit a time step explains their noise, and held-out ones tell."""
     states = batch(quadratic, episodes=10, noise=1.5)
     found = fit(states, width=0.3)
-    assert not found.per_time
+    assert not found.choice.per_time
     for t in range(1, T):
         torch.testing.assert_close(found.model.C[t], found.model.C[0], rtol=0, atol=0)
 
 
 def test_per_time_can_be_switched_off():
     found = fit(batch(varying, episodes=40), width=0.3, per_time="never")
-    assert not found.per_time
+    assert not found.choice.per_time
     torch.testing.assert_close(found.model.c[1], found.model.c[0], rtol=0, atol=0)
 
 
@@ -237,22 +258,69 @@ def test_a_good_representation_is_not_taken_for_a_dead_one(seed):
 def test_a_fit_per_time_step_is_a_weighted_regression_on_monomials():
     """Where that is positive definite; samples of neighbouring steps weigh as a Gaussian."""
     width, states = 1.3, batch(varying, episodes=200, noise=0.3)
-    z = states.z[:, :-1].numpy()
     known = states.costs.numpy() - ALPHA * np.square(states.actions.numpy()).sum(axis=-1)
-    rows, columns = np.tril_indices(m)
-    monomials = np.concatenate([z[..., rows] * z[..., columns], z, np.ones((200, T, 1))], axis=-1)
+    design = monomials(states)
     found = fit(states, width=width)
-    assert found.per_time
+    assert found.choice.per_time
     for t in range(T):
         distance = np.abs(np.arange(T) - t)
         root = np.exp(-0.25 * np.square(distance / width)) * (distance <= 3)
-        left = (root[:, None] * monomials).reshape(-1, monomials.shape[-1])
+        left = rows(root[:, None] * design)
         w = np.linalg.lstsq(left, (root * known).ravel(), rcond=None)[0]
-        half = np.zeros((m, m))
-        half[rows, columns] = w[: len(rows)]
-        expected = half + half.T
+        expected = curvature(w)
         assert np.linalg.eigvalsh(expected).min() > 0.05
         # The pull towards the one fit of all time steps moves it by a little.
         np.testing.assert_allclose(found.model.C[t, :m, :m], expected, atol=0.04)
-        np.testing.assert_allclose(found.model.c[t, :m], w[len(rows) : -1], atol=0.04)
+        np.testing.assert_allclose(found.model.c[t, :m], w[-m - 1 : -1], atol=0.04)
         np.testing.assert_allclose(found.model.b[t], w[-1], atol=0.04)
+
+
+def flat(z, t):
+    """Eight latents, of which two cost anything."""
+    return quadratic(z[:, :2], C=np.eye(2), c=np.array([2.0, -1.0]))
+
+
+# Few episodes: what older ones and a ridge are for
+
+
+def scored(found, truth, seed=9):
+    return explained(found.model, batch(truth, seed=seed, episodes=100, size=8))
+
+
+def test_a_ridge_is_chosen_where_coefficients_outnumber_what_samples_tell():
+    few = batch(flat, episodes=6, size=8, noise=3.0)
+    bare, chosen = (
+        fit(few, features=8, per_time="never", ridge=r) for r in ((0.0,), (0.0, 0.03, 0.3))
+    )
+    assert chosen.choice.ridge > 0
+    assert chosen.r2 > bare.r2
+    assert scored(chosen, flat) > scored(bare, flat) + 0.1
+
+
+def test_older_batches_support_a_fit_on_few_episodes():
+    few, old = batch(flat, episodes=5, size=8, noise=1.0), batch(flat, seed=1, size=8, noise=1.0)
+    alone, supported = (fit(few, features=8, older=past, per_time="never") for past in ((), (old,)))
+    assert supported.choice.older == 1.0
+    assert scored(supported, flat) > scored(alone, flat) + 0.02
+
+
+def test_older_batches_of_another_cost_are_left_alone():
+    newest, old = batch(flat, size=8), batch(lambda z, t: -z[:, 0], seed=1, size=8)
+    assert fit(newest, features=8, older=(old,), per_time="never").choice.older == 0.0
+
+
+def test_a_ridge_is_that_of_the_closed_form():
+    """In standardised costs; scikit-learn's weighting of w^T R w / n by hand, pure curvature."""
+    ridge, states = 0.3, batch(quadratic, episodes=100)
+    known = states.costs.numpy() - ALPHA * np.square(states.actions.numpy()).sum(axis=-1)
+    y = (known - known.mean()) / known.std(ddof=1)
+    design = rows(monomials(states))
+    i, j = np.tril_indices(m)
+    # |C|^2 / 2 + |c|^2 in weights: C_ii = 2 w_ii, and C_ij = w_ij stands in C twice.
+    penalty = np.diag([*np.where(i == j, 2.0, 1.0), *np.ones(m), 0.0])
+    left = design.T @ design / len(design) + ridge * penalty
+    w = np.linalg.solve(left, design.T @ y.ravel() / len(design)) * known.std(ddof=1)
+    assert np.linalg.eigvalsh(curvature(w)).min() > 0.02
+    found = fit(states, per_time="never", ridge=(ridge,)).model
+    np.testing.assert_allclose(found.C[0, :m, :m], curvature(w), atol=0.02)
+    np.testing.assert_allclose(found.c[0, :m], w[-m - 1 : -1], atol=0.02)

@@ -148,8 +148,10 @@ def test_dynamics_are_plain_regression_on_the_observers_rollouts(
         slopes = np.linalg.lstsq(design, z[:, t + 1], rcond=None)[0].T
         np.testing.assert_allclose(dynamics.F[t].numpy(), slopes[:, :-1], rtol=1e-6, atol=1e-8)
         np.testing.assert_allclose(dynamics.f[t].numpy(), slopes[:, -1], rtol=1e-6, atol=1e-8)
-    batch = run.learner.embedded(run.environment.collected(2), [])[0]
-    own = local.LocalLearner.fitted_cost(run.learner, batch).model
+    batch, older = run.learner.embedded(
+        run.environment.collected(2), [run.environment.collected(1)]
+    )
+    own = local.LocalLearner.fitted_cost(run.learner, batch, older).model
     assert torch.equal(cost.C, own.C)  # of the counted batch
 
 
@@ -165,7 +167,7 @@ def test_the_cost_is_fitted_on_the_observers_rollouts(
         )
     )
     settings = CostFit(width=privileged.OWN_STEP, terminal=3.0)
-    again = quadratic_cost.fit_quadratic_cost(rollouts, 0.001, settings, 4).model
+    again = quadratic_cost.fit_quadratic_cost(rollouts, [], 0.001, settings, 4).model
     assert torch.equal(cost.C, again.C)
     older = [run.environment.collected(1)]
     batches = [run.environment.collected(2), older[0]]
@@ -198,7 +200,9 @@ def test_a_fit_of_its_own_step_knows_nothing_of_the_next(monkeypatch: pytest.Mon
         z, Episodes(np.empty((200, 5)), nothing.numpy(), nothing.numpy(), costs.numpy())
     )
     curvature = [
-        quadratic_cost.fit_quadratic_cost(states, 0.0, CostFit(width=width), 2).model.C[:4, 0, 0]
+        quadratic_cost.fit_quadratic_cost(states, [], 0.0, CostFit(width=width), 2).model.C[
+            :4, 0, 0
+        ]
         for width in (privileged.OWN_STEP, 1.0)
     ]
     # But for the weak pull of every such fit towards the shared one.

@@ -41,6 +41,14 @@ def test_unshuffle_moves_blocks_into_channels():
     torch.testing.assert_close(module(x), blocks.reshape(3, 18, 2, 3), rtol=0, atol=0)
 
 
+def test_shuffle_undoes_unshuffle():
+    module, shape = network(
+        {"kind": "unshuffle", "factor": 3}, {"kind": "shuffle", "factor": 3}, shape=(2, 6, 9)
+    )
+    assert shape == (2, 6, 9)
+    torch.testing.assert_close(module(batch(2, 6, 9)), batch(2, 6, 9), rtol=0, atol=0)
+
+
 @pytest.mark.parametrize("activation", ["relu", "none"])
 @pytest.mark.parametrize(
     "more", [{}, {"stride": 2}, {"padding": 2}, {"groups": 2}, {"pool": 2}, {"size": 1}]
@@ -205,6 +213,26 @@ def test_bumps_start_with_the_width_of_the_card():
     assert float(frame[8, 12]) == pytest.approx(math.exp(-1.0), abs=1e-6)
 
 
+def test_maps_are_gaussians_at_linear_coordinates():
+    points, width, frame = 3, 0.4, (2, 12, 16)
+    layers = LAYERS.validate_python(
+        [{"kind": "maps", "points": points, "width": width, "factor": 2}]
+    )
+    module, shape = build(layers, (4,), frame)
+    for parameter in (module[0].place.weight, module[0].place.bias):
+        torch.nn.init.normal_(parameter, std=0.5)
+    inputs = batch(4)
+    w = {name: p.detach().double().numpy() for name, p in module[0].named_parameters()}
+    places = inputs.double().numpy() @ w["place.weight"].T + w["place.bias"]
+    expected = np.zeros((3, points, 6, 8))
+    for n, p, r, k in np.ndindex(expected.shape):
+        x, y = -1 + 2 * k / 7, 1 - 2 * r / 5
+        squared = (x - places[n, p]) ** 2 + (y - places[n, points + p]) ** 2
+        expected[n, p, r, k] = math.exp(-squared / (2 * width**2))
+    assert shape == (points, 6, 8)
+    np.testing.assert_allclose(module(inputs).detach(), expected, atol=1e-5)
+
+
 # Whole lists
 
 
@@ -219,6 +247,12 @@ SAWYER = [
     {"kind": "deconv", "channels": 4, "size": 6, "stride": 3},
     {"kind": "deconv", "channels": 3, "size": 6, "stride": 3, "activation": "none"},
 ]
+STAMPS = [
+    {"kind": "maps", "points": 5, "factor": 2},
+    {"kind": "conv", "channels": 8, "padding": 1},
+    {"kind": "conv", "channels": 4, "padding": 1, "activation": "none"},
+    {"kind": "shuffle", "factor": 2},
+]
 
 
 @pytest.mark.parametrize(
@@ -229,6 +263,7 @@ SAWYER = [
         (SAWYER, (5,)),
         (KEY_POINTS, (2, 32, 32)),
         (BUMPS, (4,)),
+        (STAMPS, (4,)),
         ([], (4,)),
     ],
 )
@@ -285,6 +320,8 @@ def test_the_networks_of_the_card_fit_its_frames(variant):
         ),
         ([{"kind": "bumps", "points": 2}], (2, 8, 8), r"layer 1 \(bumps\)"),
         ([{"kind": "bumps", "points": 2}], (8,), r"layer 1 \(bumps\).*images"),
+        ([{"kind": "maps", "points": 2, "factor": 4}], (8,), r"layer 1 \(maps\).*images"),
+        ([{"kind": "shuffle", "factor": 2}], (2, 8, 8), r"layer 1 \(shuffle\).*multiple of 4"),
     ],
 )
 def test_a_layer_that_does_not_fit_is_named(tables, shape, message):
