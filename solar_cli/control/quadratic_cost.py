@@ -193,21 +193,6 @@ def _held_out(folds: _Moments, support: _Moments | None, settings: CostFit) -> d
     return {**scores, **r2([best._replace(per_time=True)])}
 
 
-def explained(model: QuadraticCost, states: Trajectories) -> float:
-    """R2 of a fitted cost on other episodes."""
-    x = torch.cat([states.z[:, :-1], states.actions], dim=-1)
-    quadratic = 0.5 * torch.einsum("nti,tij,ntj->nt", x, model.C[:-1], x)
-    predicted = quadratic + torch.einsum("nti,ti->nt", x, model.c[:-1]) + model.b[:-1]
-    return _r2(predicted[states.live], states.costs[states.live])
-
-
-def _r2(predicted: Tensor, observed: Tensor) -> float:
-    residual = (predicted - observed).square().mean()
-    spread = (observed - observed.mean()).square().mean()
-    # A cost that does not vary holds nothing to explain.
-    return float(1 - residual / spread) if spread > 1e-18 else 1.0
-
-
 def _moments(
     z: Float[Tensor, "N T m"], target: Float[Tensor, "N T"], live: Bool[Tensor, "N T"]
 ) -> _Moments:

@@ -18,7 +18,7 @@ from solar_cli.control.linear_gaussian import LinearGaussianPolicy, initial_poli
 from solar_cli.control.linearise import Linearisation, linearise_policy
 from solar_cli.control.local_dynamics import LocalDynamics, infer_dynamics
 from solar_cli.control.lqr import Outcome, PolicyUpdate
-from solar_cli.control.quadratic_cost import FittedCost, explained, fit_quadratic_cost
+from solar_cli.control.quadratic_cost import FittedCost, fit_quadratic_cost
 from solar_cli.control.step_size import StepSize
 from solar_cli.control.trajectories import Trajectories
 from solar_cli.control.trust_region import Anchor, TrustRegion
@@ -233,10 +233,6 @@ class LocalLearner(ABC):
         self.trust_region = self.trust_region.restored(state["trust_region"])
         self.updates = state["updates"]
 
-    def _cost_score(
-        self, representation: Representation, learned: Episodes, held_out: Episodes
-    ) -> float:
-        fit, judge = (
-            Trajectories.of(representation.embed(part).cpu(), part) for part in (learned, held_out)
-        )
-        return explained(self.fitted_cost(fit, []).model, judge)
+    def _cost_score(self, representation: Representation, episodes: Episodes) -> float:
+        states = Trajectories.of(representation.embed(episodes).cpu(), episodes)
+        return self.fitted_cost(states, []).r2

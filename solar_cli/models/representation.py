@@ -32,11 +32,11 @@ from solar_cli.streams import Streams
 
 ACTIVE_SHARE = 0.9  # of a latent's variance that its mean must carry for it to count as active
 LEAST_EXPLAINED = 0.4  # of the variance of each channel; a dead one has next to nothing
-LEAST_COST_R2 = 0.5
+LEAST_COST_R2 = 0.3
 JUDGED_FRAMES = 600  # decoded at most to judge a batch: bounds memory
 
-CostScore = Callable[["Representation", Episodes, Episodes], float]
-"""R2 on the latter episodes of the cost that control would fit on the former."""
+CostScore = Callable[["Representation", Episodes], float]
+"""R2 of the cost that control would fit on them, each episode left out once."""
 
 
 class Candidate(NamedTuple):
@@ -143,7 +143,7 @@ class Representation:
             terms = self._trainer.fit(name, self._model, [learned], training.steps)
             self._basis = self._whitening(learned)
             metrics = self._judge(held_out)
-            metrics["held_out_cost_r2"] = self._cost_score(self, learned, held_out)
+            metrics["held_out_cost_r2"] = self._cost_score(self, episodes)
             alive = self._alive(metrics) and metrics["held_out_cost_r2"] >= LEAST_COST_R2
             self._candidates.append(Candidate(alive, {**terms, **metrics}, self._parameters()))
         best = max(self._candidates, key=lambda c: (c.alive, c.metrics["held_out_elbo"]))

@@ -5,11 +5,12 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from predicted_costs import r2
 
 from solar_cli.control.linear_gaussian import LinearGaussianPolicy
 from solar_cli.control.linearise import linearise_policy
 from solar_cli.control.local_dynamics import ACTION_RIDGE, infer_dynamics
-from solar_cli.control.quadratic_cost import explained, fit_quadratic_cost
+from solar_cli.control.quadratic_cost import fit_quadratic_cost
 from solar_cli.control.trajectories import Trajectories
 from solar_cli.models.basis import LatentBasis
 from solar_cli.models.priors import LatentPrior
@@ -171,7 +172,7 @@ def test_a_cost_is_recovered_from_live_steps(per_time):
     states = ended(SOME, rubbish=1e3, cost=quadratic)
     found = fit_quadratic_cost(states, [], 0.0, CostFit(per_time=per_time), d)
     assert found.r2 > 0.999
-    assert explained(found.model, states) > 0.999
+    assert r2(found.model, states) > 0.999
     for t in range(T):
         # L-BFGS stops at a squared error of some 1e-7 of the costs' variance.
         np.testing.assert_allclose(found.model.C[t, :d, :d], CURVED, atol=0.02)

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 import torch
+from predicted_costs import r2
 
-from solar_cli.control.quadratic_cost import FOLDS, explained, fit_quadratic_cost
+from solar_cli.control.quadratic_cost import FOLDS, fit_quadratic_cost
 from solar_cli.control.trajectories import Trajectories
 from solar_cli.settings.local import CostFit
 
@@ -50,21 +51,6 @@ def curvature(w):
     half = np.zeros((m, m))
     half[np.tril_indices(m)] = w[: m * (m + 1) // 2]
     return half + half.T
-
-
-def predicted(model, states):
-    """Costs (N, T) of the model, as control reads it."""
-    x = np.concatenate([states.z[:, :-1].numpy(), states.actions.numpy()], axis=-1)
-    second = np.einsum("nti,tij,ntj->nt", x, model.C[:-1].numpy(), x)
-    return 0.5 * second + np.einsum("nti,ti->nt", x, model.c[:-1].numpy()) + model.b[:-1].numpy()
-
-
-def r2(model, states):
-    costs = states.costs.numpy()
-    return (
-        1
-        - np.square(predicted(model, states) - costs).sum() / np.square(costs - costs.mean()).sum()
-    )
 
 
 # What is known is found
@@ -174,12 +160,6 @@ def test_r2_is_that_of_episodes_left_out():
     assert fit(states, per_time="never", ridge=(0.0,)).r2 == pytest.approx(expected, abs=0.01)
 
 
-def test_r2_on_other_episodes_is_that_of_the_models_predictions():
-    model, others = fit(batch(quadratic)).model, batch(lambda z, t: z[:, 0] ** 3, seed=9)
-    assert explained(model, others) == pytest.approx(r2(model, others), rel=1e-12)
-    assert explained(model, batch(quadratic, seed=9)) > 0.999
-
-
 def varying(z, t):
     """The minimum moves, and the curvature with it."""
     return quadratic(z, C=(1 + t) * C / 3, c=c * (t - 2), b=b)
@@ -252,7 +232,7 @@ def test_a_good_representation_is_not_taken_for_a_dead_one(seed):
         )
         for rows in (slice(51), slice(51, None))
     )
-    assert explained(fit(learned, features=4, per_time="never").model, judge) > 0.8
+    assert r2(fit(learned, features=4, per_time="never").model, judge) > 0.8
 
 
 def test_a_fit_per_time_step_is_a_weighted_regression_on_monomials():
@@ -284,7 +264,7 @@ def flat(z, t):
 
 
 def scored(found, truth, seed=9):
-    return explained(found.model, batch(truth, seed=seed, episodes=100, size=8))
+    return r2(found.model, batch(truth, seed=seed, episodes=100, size=8))
 
 
 def test_a_ridge_is_chosen_where_coefficients_outnumber_what_samples_tell():

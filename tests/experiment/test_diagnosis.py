@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from predicted_costs import r2
 
 from solar_cli.control import quadratic_cost
 from solar_cli.control.trajectories import Trajectories
@@ -255,7 +256,7 @@ def test_with_everything_known_the_model_is_the_simulator(
     x = torch.cat([states.z[:, :-1], states.actions], dim=-1)
     predicted = torch.einsum("tij,ntj->nti", dynamics.F, x) + dynamics.f
     torch.testing.assert_close(predicted, states.z[:, 1:], rtol=0.0, atol=1e-5)
-    assert quadratic_cost.explained(cost, states) > 0.999
+    assert r2(cost, states) > 0.999
 
 
 def test_what_is_rolled_out_is_the_policy_that_collected_though_training_went_on(

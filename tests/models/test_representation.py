@@ -42,11 +42,11 @@ class Scores:
     def __init__(self, *scores: float) -> None:
         self.scores = scores
         self.states: list[torch.Tensor] = []
-        self.episodes: list[tuple[Episodes, Episodes]] = []
+        self.episodes: list[Episodes] = []
 
-    def __call__(self, model: Representation, learned: Episodes, held_out: Episodes) -> float:
+    def __call__(self, model: Representation, episodes: Episodes) -> float:
         self.states.append(model.embed(FIRST))
-        self.episodes.append((learned, held_out))
+        self.episodes.append(episodes)
         return self.scores[min(len(self.states), len(self.scores)) - 1]
 
 
@@ -155,6 +155,10 @@ def test_a_living_one_is_kept_whatever_its_elbo():
 
 @pytest.mark.filterwarnings("ignore:no representation")
 def test_attempts_are_judged_on_episodes_that_they_did_not_learn_from(monkeypatch):
+    judged, judge = [], Representation._judge
+    monkeypatch.setattr(
+        Representation, "_judge", lambda self, frames: judged.append(frames) or judge(self, frames)
+    )
     standardised, original = [], representation.FrameModel.standardise_by
     monkeypatch.setattr(
         representation.FrameModel,
@@ -164,9 +168,10 @@ def test_attempts_are_judged_on_episodes_that_they_did_not_learn_from(monkeypatc
     score = Scores(0.0)
     make(score, held_out=0.3, attempts=2).update(Collected(FIRST))
     kept = round(0.3 * 14)
-    for learned, held_out in score.episodes:
-        np.testing.assert_array_equal(learned.frames, FIRST.frames[:-kept])
+    assert len(judged) == len(score.episodes) == len(standardised) == 2
+    for held_out, every in zip(judged, score.episodes, strict=True):
         np.testing.assert_array_equal(held_out.frames, FIRST.frames[-kept:])
+        np.testing.assert_array_equal(every.frames, FIRST.frames)
     for frames in standardised:
         np.testing.assert_array_equal(frames, FIRST.frames[:-kept].reshape(-1, 3))
 
