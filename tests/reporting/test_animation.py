@@ -140,6 +140,7 @@ def test_the_seed_that_is_shown_is_the_one_in_the_middle(tmp_path):
     assert shown.seed == 2
     assert shown.animation
     assert shown.reconstruction
+    assert shown.latents
     assert shown.damage == ()
 
 
