@@ -87,7 +87,7 @@ class Training(Settings):
     segments: int = setting(10, "segments of consecutive frames a step", ge=1)
     length: int = setting(12, "frames of a segment", ge=2)
     decoded: float = setting(0.5, "share of a step's frames that are decoded", gt=0, le=1)
-    learning_rate: float = setting(2e-3, "Adam", gt=0)
+    learning_rate: float = setting(5e-3, "Adam", gt=0)
     schedule: Literal["cosine", "constant"] = setting("cosine", "of the learning rate")
     clip: float = setting(50.0, "largest norm of the gradient", gt=0)
     kl_start: float = setting(1e-4, "weight of the KL terms at first", gt=0)
