@@ -248,7 +248,7 @@ def checkpoints(batches: list[Collected], **changes) -> tuple[list[Any], str, li
     return saved, digest(model.state_dict()), metrics
 
 
-SCORES = (0.1, 0.2, 0.9)
+SCORES = (0.01, 0.02, 0.9)
 
 
 def without_seconds(metrics: dict[str, float]) -> dict[str, float]:
