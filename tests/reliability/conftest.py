@@ -18,11 +18,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture
-def matrix(tmp_path: Path) -> Iterator[Callable[[int], Matrix]]:
+def matrix(tmp_path: Path) -> Iterator[Callable[..., Matrix]]:
     made: list[Matrix] = []
 
-    def make(seeds: int) -> Matrix:
-        made.append(Matrix(tmp_path / str(len(made)), seeds))
+    def make(seeds: int, task: str = "nav") -> Matrix:
+        made.append(Matrix(tmp_path / str(len(made)), seeds, task))
         made[-1].folder.mkdir()
         return made[-1]
 

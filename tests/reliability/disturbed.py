@@ -27,6 +27,7 @@ class Matrix:
 
     folder: Path
     seeds: int = 1
+    task: str = "nav"
     kills: int = 0
     schedulers: list[subprocess.Popen[bytes]] = field(default_factory=list)
 
@@ -45,7 +46,8 @@ class Matrix:
 
         Without pause between them, there is a checkpoint at every pulse.
         """
-        settings = [self.db, str(self.seeds), str(checkpoint_seconds), str(self.results), *sets]
+        settings = [self.db, self.task, str(self.seeds), str(checkpoint_seconds)]
+        settings += [str(self.results), *sets]
         scheduler = subprocess.Popen(
             [sys.executable, str(HERE / "drive.py"), *settings],
             env=os.environ | {"DIE": die, "KILLS": str(self.folder / "kills.txt")},

@@ -1,6 +1,6 @@
 """``solar run`` on the smoke variant, with a worker that can be told to die.
 
-python drive.py DATABASE SEEDS CHECKPOINT_SECONDS RESULTS.json [PATH=VALUE]...
+python drive.py DATABASE TASK SEEDS CHECKPOINT_SECONDS RESULTS.json [PATH=VALUE]...
 """
 
 import json
@@ -16,15 +16,14 @@ from solar_cli.store.store import Store
 
 # The encoder moves in every iteration, so that each has pulses and an update that depends on it.
 SETS = ["methods.solar.training.steps=60", "methods.solar.training.fine_tune_steps=40"]
-TARGET = 16  # three iterations
 
-database, seeds, checkpoint_seconds, out, *sets = sys.argv[1:]
+database, task, seeds, checkpoint_seconds, out, *sets = sys.argv[1:]
 worker = Path(__file__).parent / "mortal_worker.py"
 engine = LocalEngine([sys.executable, str(worker)]) if os.environ["DIE"] else LocalEngine()
-wanted = cells(load_card("nav"), "solar", range(int(seeds)), "smoke", [*SETS, *sets], "kills")
+wanted = cells(load_card(task), "solar", range(int(seeds)), "smoke", [*SETS, *sets], "kills")
 with Store.open(database) as store:
     results = run(
-        plan(store, wanted, TARGET),
+        plan(store, wanted, 16 if task == "nav" else "desk"),  # three iterations
         store,
         engine=engine,
         workers=2,

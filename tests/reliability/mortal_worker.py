@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-from solar_cli.envs.task import RowTask
+from solar_cli.envs.task import LoopTask, RowTask
 from solar_cli.episodes import Environment
 from solar_cli.experiment import checkpointing, session, worker
 from solar_cli.experiment.judge import Judge
@@ -49,19 +49,17 @@ def after(owner: Any, name: str) -> None:
 def inside_evaluation() -> None:
     """Strike at steps of a simulator that a judge runs."""
     whole: Callable[..., Any] = Judge.evaluate
+    kinds = (RowTask, LoopTask)
 
     def evaluate(self: Judge, *args: Any) -> Any:
-        step = RowTask.step
-
-        def striking(task: RowTask, actions: Any) -> Any:
-            strike()
-            return step(task, actions)
-
-        RowTask.step = striking  # type: ignore[method-assign]
+        steps = [kind.step for kind in kinds]
+        for kind in kinds:
+            after(kind, "step")
         try:
             return whole(self, *args)
         finally:
-            RowTask.step = step  # type: ignore[method-assign]
+            for kind, step in zip(kinds, steps, strict=True):
+                kind.step = step  # type: ignore[method-assign]
 
     Judge.evaluate = evaluate  # type: ignore[method-assign]
 
