@@ -74,7 +74,7 @@ class TrustRegion:
             again = self.rejections + 1
             return replace(self, current=self.best, step=step, kept=kept, rejections=again)
         step = self.step.after(self.promised, kept)
-        if step.multiplier > self.step.multiplier and not self.trusts(self.promised):
+        if step.multiplier > self.step.multiplier and not self._matters(self.promised):
             step = self.step  # what is left to gain is small: no larger step is needed
         return replace(
             self,
@@ -102,7 +102,14 @@ class TrustRegion:
         return self.current
 
     def trusts(self, promised: float) -> bool:
-        """Whether an update that promises this fall of the cost may be handed over untried."""
+        """Whether an update that promises this fall of the cost may be handed over untried.
+
+        Not after one that was taken back: what the model promised of that was not true either.
+        """
+        return self.rejections == 0 and self._matters(promised)
+
+    def _matters(self, promised: float) -> bool:
+        """Whether this fall of the cost is more than a model is good for."""
         assert self.best is not None
         return promised >= LEAST_PROMISE * (self.first - self.best.cost)
 
