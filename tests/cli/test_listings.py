@@ -130,6 +130,23 @@ def test_show_works_for_a_cell_in_any_state(solar: Solar, stored: Stored, name: 
     inert(done)
 
 
+def test_show_says_what_needs_a_look(solar: Solar, stored: Stored) -> None:
+    assert "needs a look" not in solar("show", stored.finished.hash, "--db", stored.db).out
+    with Store.open(str(stored.db)) as store:
+        attempt = store.claim(stored.pending.hash, Owner.current(), 8, {})
+        signs = [Metric("stuck", 1.0), Metric("alive", 1.0)]
+        totals = {"steps": 80, "simulated_seconds": 80.0, "seconds": 5.0}
+        store.commit(stored.pending.hash, attempt, iteration=1, episodes=8, metrics=signs, **totals)
+    [line] = [
+        line
+        for line in solar("show", stored.pending.hash, "--db", stored.db).out.splitlines()
+        if line.startswith("needs a look: ")
+    ]
+    assert "episodes come to rest" in line
+    entry = json.loads(solar("show", stored.pending.hash, "--json", "--db", stored.db).out)
+    assert [f"needs a look: {sign}" for sign in entry["needs_a_look"]] == [line]
+
+
 def test_export_has_one_row_a_metric_in_every_format(
     solar: Solar, stored: Stored, tmp_path: Path
 ) -> None:
