@@ -9,6 +9,7 @@ import pytest
 from scenario import Done, Solar, Stored
 from stored_cells import store_attempt
 
+from solar_cli.settings import cells, load_card
 from solar_cli.store.owner import Owner
 from solar_cli.store.records import Metric, Outcome
 from solar_cli.store.store import Store
@@ -28,7 +29,7 @@ def test_status_shows_the_state_of_every_cell(solar: Solar, stored: Stored) -> N
     lines = {line.split()[0]: line for line in done.out.splitlines() if line.strip()}
     for state in ("finished", "stale", "diverged", "failed", "interrupted", "pending"):
         assert state in lines[getattr(stored, state).hash[:8]]
-    assert "final_distance 0.04" in lines[stored.finished.hash[:8]]
+    assert lines[stored.finished.hash[:8]].split()[-2:] == ["final_distance", "0.04"]
     assert "NaN in the ELBO" in lines[stored.diverged.hash[:8]]
     assert "[bold]not bold[/bold]" in done.out  # shown as it is, not as markup
     assert (
@@ -292,6 +293,24 @@ def test_a_narrow_status_keeps_a_line_a_cell_with_hash_and_state(
         [line] = [line for line in lines if line.startswith(cell.hash[:8])]
         assert state in line.split()
         assert str(cell.seed) in line.split()
+        assert cell.variant in line.split()
+    assert lines[0].split()[-1] in ("value", "note")
+
+
+@pytest.mark.parametrize("width", [80, 70])
+def test_a_narrow_status_cuts_a_long_variant_and_keeps_it(
+    solar: Solar, stored: Stored, monkeypatch: pytest.MonkeyPatch, width: int
+) -> None:
+    [cell] = cells(load_card("inverted-pendulum"), "solar", [0], "smoke", ["task.horizon=9"], "x1")
+    long = cells(load_card("nav"), "solar", [0], "smoke", ["task.horizon=9"], "a-" + "long-" * 9)
+    with Store.open(str(stored.db)) as store:
+        store.add([cell, *long])
+    monkeypatch.setenv("COLUMNS", str(width))
+    lines = solar("status", "--db", stored.db).out.splitlines()
+    assert max(map(len, lines)) <= width
+    for one, shown in ((cell, "x1"), (long[0], "a-lo")):
+        [line] = [line for line in lines if line.startswith(one.hash[:8])]
+        assert line.split()[3].startswith(shown)
 
 
 def test_a_bad_card_does_not_hide_the_others(solar: Solar, tmp_path: Path) -> None:
