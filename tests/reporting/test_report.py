@@ -1,6 +1,7 @@
 """A whole report on a real small database."""
 
 import csv
+import shutil
 from html.parser import HTMLParser
 
 import pytest
@@ -97,6 +98,21 @@ def test_a_curve_that_a_seed_has_just_begun_to_cut_is_told_of_where_it_is_printe
     ends = "ends at 0 of 20 episodes, where its shortest seed ends (seed 2)"
     assert said == f"nav solar: {ends}"
     assert f"solar: {ends}" in (tmp_path / "out" / "index.html").read_text()
+
+
+def test_a_report_without_the_files_of_the_cells_keeps_its_numbers(tmp_path):
+    with database(tmp_path) as store:
+        of = cell("solar", 0)
+        attempt = compute(store, of, [1.0, 0.6], None)
+        add_pictures(store, of, attempt)
+        store.end(of.hash, attempt, Outcome.FINISHED)
+        shutil.rmtree(store.home / "cells")
+        (headline,) = report(store, tmp_path / "out").lines
+    text = (tmp_path / "out" / "index.html").read_text()
+    assert "final_distance 0.6" in headline
+    assert "put the cell&#39;s files beside the database" in text
+    assert "--redo" not in text
+    assert str(tmp_path) not in text
 
 
 def test_the_page_says_what_stands_in_for_the_default_solar(tmp_path):
