@@ -92,4 +92,4 @@ Output = Annotated[
     str | None,
     typer.Option("--output", metavar="FILE", help="Write there instead of to standard output."),
 ]
-Force = Annotated[bool, typer.Option("--force", help="Overwrite an existing --output file.")]
+Force = Annotated[bool, typer.Option("--force", help="Overwrite an existing file.")]

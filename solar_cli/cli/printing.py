@@ -129,8 +129,19 @@ def duration(seconds: float | None) -> str:
     return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
 
 
-def deliver(content: str | bytes, output: str | None, force: bool) -> None:
-    """Write to standard output, or whole or not at all to a file.
+def require_free(option: str, output: str, force: bool) -> None:
+    """Raise `UsageError` for a file that exists, and one whose folder does not."""
+    path = Path(output)
+    if path.exists() and not force:
+        raise UsageError(f"{option} {output}: the file exists; add --force to overwrite it")
+    if not path.parent.is_dir():
+        raise UsageError(f"{option} {output}: there is no folder {path.parent}; make it first")
+
+
+def deliver(
+    content: str | bytes, output: str | None, force: bool, option: str = "--output"
+) -> None:
+    """Write to standard output, or whole or not at all to the file that ``option`` names.
 
     Raises `UsageError` for a file that exists and one that cannot be written.
     """
@@ -141,15 +152,14 @@ def deliver(content: str | bytes, output: str | None, force: bool) -> None:
         else:
             sys.stdout.buffer.write(data)
         return
+    require_free(option, output, force)
     path = Path(output)
-    if path.exists() and not force:
-        raise UsageError(f"--output {output}: the file exists; add --force to overwrite it")
     beside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         beside.write_bytes(data)
         beside.replace(path)
     except OSError as error:
         raise UsageError(
-            f"--output {output}: {error.strerror or error}; name a file in a folder you may write"
+            f"{option} {output}: {error.strerror or error}; name a file in a folder you may write"
         ) from error
     complain(f"wrote {output} ({len(data)} bytes)")

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from solar_cli.cli.options import (
     AsJson,
     Database,
+    Force,
     Sets,
     complete_method,
     complete_task,
     complete_variant,
 )
-from solar_cli.cli.printing import print_json, print_table, say
+from solar_cli.cli.printing import deliver, print_json, print_table, require_free, say
 from solar_cli.errors import UsageError
+from solar_cli.wording import counted
+
+if TYPE_CHECKING:
+    from solar_cli.settings import TaskSettings
 
 
 def command(
@@ -30,10 +36,16 @@ def command(
         str, typer.Option(help="In this variant.", autocompletion=complete_variant)
     ] = "default",
     sets: Sets = None,
+    preview: Annotated[
+        str | None,
+        typer.Option(metavar="FILE.gif", help="Draw an episode of exploration noise, instead."),
+    ] = None,
+    force: Force = False,
     json: AsJson = False,
     db: Database = None,
 ) -> None:
-    """List the tasks, or show every setting of one and where its value comes from.
+    """List the tasks, or show every setting of one and where its value comes from. With --preview
+    draw one instead: what a learner sees, and what people do.
 
     \b
     Example:
@@ -42,14 +54,18 @@ def command(
     from solar_cli.cli.shadowing import card_files, tell_misspelt, tell_shadowed
     from solar_cli.settings import card_names, load_card, resolve
 
+    if preview is not None:
+        _require_gif(name, preview, force)
     if name is not None:
         from solar_cli.cli.configuration import print_lines, resolved_lines
 
         tell_shadowed([name])
         tell_misspelt([name])
-        print_lines(
-            resolved_lines(resolve(load_card(name), method, variant, sets or ()), method), json
-        )
+        resolved = resolve(load_card(name), method, variant, sets or ())
+        if preview is None:
+            print_lines(resolved_lines(resolved, method), json)
+        else:
+            _draw(name, resolved.configuration.task, preview, force, json)
         return
     cards, faults = [], {}
     found = [known for known in card_names() if card_files(known)]
@@ -91,3 +107,44 @@ def command(
     )
     for known, fault in faults.items():
         say(f"{known}: {fault}")
+
+
+def _require_gif(name: str | None, preview: str, force: bool) -> None:
+    """Raise `UsageError` for a file that no preview can be written to, before anything runs."""
+    if name is None:
+        raise UsageError(f"--preview {preview}: of which task? solar tasks NAME --preview FILE.gif")
+    if Path(preview).suffix.lower() != ".gif":
+        raise UsageError(f"--preview {preview}: animations are GIFs; name a file FILE.gif")
+    require_free("--preview", preview, force)
+
+
+def _draw(name: str, task: TaskSettings, preview: str, force: bool, json: bool) -> None:
+    """Run an episode of the task, and write its animation."""
+    from solar_cli.experiment.preview import first_episode
+    from solar_cli.reporting import animation
+
+    drawn = _drawable(name, task)
+    episode = first_episode(drawn)
+    steps = int(episode.lengths[0])
+    shown = animation.preview(task, drawn, episode.frames[0, : steps + 1])
+    deliver(shown.gif, preview, force, "--preview")
+    if json:
+        print_json({"task": name, "preview": preview, "steps": steps, "caption": shown.caption})
+        return
+    early = f", which ended it before {task.horizon}" if steps < task.horizon else ""
+    say(f"{name}: {counted(steps, 'step')} of exploration noise{early}; {shown.caption}")
+
+
+def _drawable(name: str, task: TaskSettings) -> TaskSettings:
+    """The task, seen as images. Raises `UsageError` where there are none."""
+    from solar_cli.envs import build_task, drawable
+
+    if task.observation.kind == "state":
+        build_task(task)  # what is wrong with the card is told as it is
+    try:
+        return drawable(task)
+    except UsageError as error:
+        raise UsageError(
+            f"--preview: there is nothing to draw of {name}, which can be learned all the same: "
+            f"{error}"
+        ) from error

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
+from solar_cli.control.exploration import smooth_noise
 from solar_cli.control.linear_gaussian import LinearGaussianPolicy
 from solar_cli.models.basis import LatentBasis
 
@@ -37,22 +37,6 @@ class Acting(NamedTuple):
     """unit-variance noise, or None for a noise-free policy"""
     latents: tuple[Tensor, ...]
     """(N, d) latents of the window's frames, newest first"""
-
-
-def smooth_noise(
-    shape: tuple[int, int, int], smoothing: float, stream: np.random.Generator
-) -> NDArray[np.float64]:
-    """(N, T, a) unit-variance noise, correlated over about ``smoothing`` steps."""
-    if smoothing == 0:
-        return stream.standard_normal(shape)
-    reach = int(4 * smoothing + 0.5)
-    count, horizon, size = shape
-    white = stream.standard_normal((count, horizon + 2 * reach, size))
-    smooth = gaussian_filter1d(white, smoothing, axis=1)[:, reach : reach + horizon]
-    impulse = np.zeros(2 * reach + 1)
-    impulse[reach] = 1.0
-    gain = np.sqrt(np.square(gaussian_filter1d(impulse, smoothing)).sum())
-    return np.asarray(smooth / gain)
 
 
 class LatentPolicy:

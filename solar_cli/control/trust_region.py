@@ -59,8 +59,8 @@ class TrustRegion:
     """fall of the cost that the last update predicted"""
     kept: float = math.nan
     """fall of the cost that was measured for it"""
-    rejected: bool = False
-    """whether the last policy was worse than the best, and taken back"""
+    rejections: int = 0
+    """last policies in a row that were worse than the best, and taken back"""
     first: float = math.nan
     """cost of the first policy, which knows nothing"""
 
@@ -71,7 +71,8 @@ class TrustRegion:
         kept = self.current.cost - tried.cost
         if tolerance != "never" and tried.cost > self.best.cost + self._margin(tried, tolerance):
             step = self.step.after_rejection()
-            return replace(self, current=self.best, step=step, kept=kept, rejected=True)
+            again = self.rejections + 1
+            return replace(self, current=self.best, step=step, kept=kept, rejections=again)
         step = self.step.after(self.promised, kept)
         if step.multiplier > self.step.multiplier and not self.trusts(self.promised):
             step = self.step  # what is left to gain is small: no larger step is needed
@@ -81,13 +82,17 @@ class TrustRegion:
             best=tried if tried.cost < self.best.cost else self.best,
             current=tried,
             kept=kept,
-            rejected=False,
+            rejections=0,
         )
 
     def _margin(self, tried: Anchor, tolerance: float) -> float:
-        """By how much a batch may be worse than the best: its noise, or next to nothing."""
+        """By how much a batch may be worse than the best: its noise, or next to nothing.
+
+        The more batches in a row were worse, the likelier the best one was just lucky: each widens
+        the margin, or a lucky batch would be built upon for ever (car, seed 102: five in a row).
+        """
         assert self.best is not None
-        noise = tolerance * math.hypot(tried.error, self.best.error)
+        noise = tolerance * (1 + self.rejections) * math.hypot(tried.error, self.best.error)
         return max(noise, NEXT_TO_NOTHING * (self.first - self.best.cost))
 
     @property
@@ -106,7 +111,7 @@ class TrustRegion:
         falls = {"predicted_improvement": self.promised, "actual_improvement": self.kept}
         return {
             **(falls if math.isfinite(self.promised) else {}),
-            "rejected": float(self.rejected),
+            "rejected": float(self.rejections > 0),
             "step_multiplier": self.step.multiplier,
         }
 
@@ -118,6 +123,7 @@ class TrustRegion:
             "current": _plain(self.current),
             "promised": self.promised,
             "first": self.first,
+            "rejections": self.rejections,
         }
 
     def restored(self, state: dict[str, Any]) -> TrustRegion:
@@ -129,6 +135,7 @@ class TrustRegion:
             current=_anchor(state["current"]),
             promised=state["promised"],
             first=state["first"],
+            rejections=state.get("rejections", 0),  # of a cell that an older version saved
         )
 
 

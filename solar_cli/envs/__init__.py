@@ -2,6 +2,7 @@
 
 A simulator is a module with two functions, ``build(settings) -> Restartable`` and
 ``picture(frames, factor) -> (..., H factor, W factor, 3)`` in [0, 1], and a line in `SIMULATORS`.
+One that shows states has a third, ``drawable(settings, rows)``: the same task, seen as images.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from solar_cli.envs.task import Frames, Restartable, Task
 from solar_cli.errors import UsageError, nearest
 from solar_cli.settings import TaskSettings
 
-__all__ = ["SIMULATORS", "Task", "build_task", "picture"]
+__all__ = ["SIMULATORS", "Task", "build_task", "drawable", "picture"]
 
 SIMULATORS = {
     "gymnasium": "solar_cli.envs.gymnasium_task",
@@ -38,6 +39,17 @@ def picture(settings: TaskSettings, frames: Frames, factor: int = 8) -> NDArray[
     """Learner frames (..., C, H, W) as pictures for people, RGB (..., H factor, W factor, 3)."""
     colours: NDArray[np.float64] = _simulator(settings).picture(frames, factor)
     return np.rint(255.0 * colours).astype(np.uint8)
+
+
+def drawable(settings: TaskSettings, rows: int = 240) -> TaskSettings:
+    """The same task, seen as images: as it is, or with that many rows in place of a state.
+
+    Raises `UsageError` where there is nothing to draw.
+    """
+    if settings.observation.kind == "image":
+        return settings
+    seen: TaskSettings = _simulator(settings).drawable(settings, rows)
+    return seen
 
 
 def _simulator(settings: TaskSettings) -> ModuleType:

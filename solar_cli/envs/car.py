@@ -14,7 +14,7 @@ import numpy as np
 from solar_cli.envs.rasteriser import Box, Disc, draw_figure, enlarge
 from solar_cli.envs.task import Floats, Frames, RowTask, check_parameters
 from solar_cli.errors import UsageError
-from solar_cli.settings import TaskSettings
+from solar_cli.settings import Observation, TaskSettings
 
 STEP = 0.1
 """seconds of a step, as in the authors' release"""
@@ -174,6 +174,12 @@ def build(settings: TaskSettings) -> RowTask:
             "height = width"
         )
     return RowTask(CarFromImages(settings.action_cost, seen.height), settings)
+
+
+def drawable(settings: TaskSettings, rows: int) -> TaskSettings:
+    """The same task seen as square images with that many rows."""
+    seen = Observation(kind="image", height=rows, width=rows)
+    return settings.model_copy(update={"observation": seen})
 
 
 def picture(frames: Frames, factor: int) -> Floats:

@@ -37,6 +37,8 @@ class Camera:
     """
 
     def __init__(self, seen: Observation) -> None:
+        self.rendered = (0, 0)
+        """rows and columns that an environment rendered last"""
         self._seen = seen
         self._renderer: Any = None
 
@@ -45,6 +47,7 @@ class Camera:
         drawn = self._lent(env) if hasattr(env.unwrapped, "mujoco_renderer") else env.render()
         if not isinstance(drawn, np.ndarray) or drawn.shape[2:] != (3,):
             raise TypeError(f"it renders {type(drawn).__name__}, not an array (rows, columns, 3)")
+        self.rendered = drawn.shape[:2]
         planes = np.moveaxis(drawn.astype(np.float64), -1, 0)
         if self._seen.channels == 1:
             planes = np.tensordot(LUMA, planes, axes=1)[None]
@@ -244,6 +247,21 @@ def build(settings: TaskSettings) -> LoopTask:
     return LoopTask(lambda: GymnasiumEpisode(parameters, settings, camera), settings)
 
 
+def drawable(settings: TaskSettings, rows: int) -> TaskSettings:
+    """The same task seen as the environment renders it, ``rows`` high and in its proportions.
+
+    Raises `UsageError` for an environment that renders nothing here.
+    """
+    where = f"simulator {settings.simulator!r}"
+    parameters = validated(Parameters, settings.parameters, where, "task.parameters")
+    seen = Observation(kind="image", height=rows, width=rows, channels=3)
+    shown, camera = settings.model_copy(update={"observation": seen}), Camera(seen)
+    GymnasiumEpisode(parameters, shown, camera).reset(np.random.default_rng(0))
+    high, wide = camera.rendered
+    seen = seen.model_copy(update={"width": round(rows * wide / high)})
+    return settings.model_copy(update={"observation": seen})
+
+
 def _make(parameters: Parameters, settings: TaskSettings) -> Any:
     import gymnasium
 
@@ -279,8 +297,8 @@ def _make(parameters: Parameters, settings: TaskSettings) -> Any:
         ) from error
     if image and "rgb_array" not in (modes := env.metadata.get("render_modes", [])):
         raise UsageError(
-            f"task.observation.kind: {name} renders no images, its render modes are {modes}: set "
-            "kind = 'state'"
+            f"task.observation.kind: {name} renders no images, its render modes are {modes}: only "
+            "its state can be seen, kind = 'state'"
         )
     return env
 

@@ -1,4 +1,7 @@
-"""What a report shows of a finished cell: its policy at work, and frames as its model sees them."""
+"""What a report shows of a finished cell: its policy at work, and frames as its model sees them.
+
+All of it is of the last evaluation, and so is the truth that the latents stand beside.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from solar_cli.episodes import Episodes
+from solar_cli.episodes import Evaluation
 from solar_cli.methods import Learner
 from solar_cli.store.store import Store
 
@@ -16,27 +19,40 @@ SHOWN = 6
 """episodes of the animation"""
 RECONSTRUCTED = 8
 """frames beside their reconstructions"""
+POINTS = 2000
+"""latents, at most"""
+
+Arrays = dict[str, NDArray[Any]]
 
 
 def exhibit(
-    store: Store, cell: str, attempt: int, iteration: int, kind: str, shown: Episodes, of: Learner
+    store: Store,
+    cell: str,
+    attempt: int,
+    iteration: int,
+    kind: str,
+    judged: Evaluation,
+    of: Learner,
 ) -> None:
-    """Store the artifacts ``animation`` and, for a learner that reconstructs, ``reconstruction``.
+    """Store the artifacts ``animation`` and, of a learner that has them, the two others.
 
     ``animation.npz`` has ``frames`` (K, T+1, *frame) and ``kind``, what they are (``image`` or
-    ``state``); ``reconstruction.npz`` has ``original`` and ``reconstruction`` (M, *frame).
+    ``state``); ``reconstruction.npz`` has ``original`` and ``reconstruction`` (M, *frame);
+    ``latents.npz`` has ``latents`` (n, d), and where the simulator was at each, ``truth`` (n, k)
+    with its ``names`` (k,).
     """
-    episodes = shown[:SHOWN]
-    exhibits: dict[str, dict[str, NDArray[Any]]] = {
-        "animation": {"frames": episodes.frames, "kind": np.array(kind)}
-    }
+    episodes = judged.episodes[:SHOWN]
+    exhibits: dict[str, Arrays] = {"animation": {"frames": episodes.frames, "kind": np.array(kind)}}
     seen = of.reconstruct(episodes)
     if seen is not None:
-        rows = _spread(episodes.frames.shape[:2])
+        count, times = episodes.frames.shape[:2]
+        rows = np.unravel_index(_spread(count * times, RECONSTRUCTED), (count, times))
         exhibits["reconstruction"] = {
             "original": episodes.frames[rows],
             "reconstruction": seen[rows],
         }
+    if judged.truth_names and (latents := of.encode(judged.episodes)) is not None:
+        exhibits["latents"] = _points(judged, latents)
     for name, arrays in exhibits.items():
         path = store.folder(cell) / f"{name}.npz"
         beside = path.with_name(f".{name}.{os.getpid()}.npz")
@@ -45,7 +61,17 @@ def exhibit(
         store.add_artifact(cell, attempt, name, path, iteration)
 
 
-def _spread(shape: tuple[int, ...]) -> tuple[NDArray[np.intp], ...]:
-    """Indices of a few frames, spread over episodes and times so that they differ."""
-    chosen = np.linspace(0, shape[0] * shape[1] - 1, RECONSTRUCTED).round().astype(np.intp)
-    return tuple(np.unravel_index(np.unique(chosen), shape))
+def _points(judged: Evaluation, latents: NDArray[Any]) -> Arrays:
+    """Some latents of live frames, and the truth behind them."""
+    live = judged.episodes.live_frames
+    some = _spread(int(live.sum()), POINTS)
+    return {
+        "latents": latents[live][some].astype(np.float32),
+        "truth": judged.truth[live][some].astype(np.float32),
+        "names": np.array(judged.truth_names),
+    }
+
+
+def _spread(count: int, most: int) -> NDArray[np.intp]:
+    """Indices of at most so many of ``count``, evenly from the first to the last."""
+    return np.unique(np.linspace(0, count - 1, most).round().astype(np.intp))

@@ -195,7 +195,7 @@ class Session:
             self._attempt,
             self._iteration,
             self._cell.configuration.task.observation.kind,
-            self._evaluation.episodes,
+            self._evaluation,
             self.learner,
         )
 

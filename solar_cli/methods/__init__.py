@@ -45,5 +45,8 @@ class Learner(Protocol):
     def diagnose(self, evaluation: Evaluation) -> dict[str, float]:
         """Metrics of the representation against the truth: for a judge, never learned from."""
 
+    def encode(self, episodes: Episodes) -> NDArray[Any] | None:
+        """(N, T+1, d) the newest latents at every frame; None for a method without."""
+
     def reconstruct(self, episodes: Episodes) -> NDArray[Any] | None:
         """Frames as the model sees them, like ``episodes.frames``; None for a method without."""

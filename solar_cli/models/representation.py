@@ -32,7 +32,7 @@ from solar_cli.streams import Streams
 
 ACTIVE_SHARE = 0.9  # of a latent's variance that its mean must carry for it to count as active
 LEAST_EXPLAINED = 0.4  # of the variance of each channel; a dead one has next to nothing
-LEAST_COST_R2 = 0.3
+LEAST_COST_R2 = 0.1
 JUDGED_FRAMES = 600  # decoded at most to judge a batch: bounds memory
 
 CostScore = Callable[["Representation", Episodes], float]

@@ -1,10 +1,10 @@
-"""Pictures for people from a cell's artifacts: the policy at work, and what its model sees."""
+"""Pictures for people: a task in motion, a cell's policy at work, what its model sees."""
 
 from __future__ import annotations
 
 import hashlib
 import io
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +14,14 @@ from solar_cli.envs import picture
 from solar_cli.errors import SolarError
 from solar_cli.settings import TaskSettings
 from solar_cli.store.records import ArtifactRecord
+from solar_cli.wording import counted
 
 Pictures = NDArray[np.uint8]
 
 SIDE = 160
 """Least height of one frame on the screen, in pixels."""
+PREVIEW_SIDE = 240
+"""The same, where there is one episode only."""
 GAP = 8
 """White pixels between frames that stand side by side."""
 EPISODES = 4
@@ -29,6 +32,14 @@ PALETTE_FRAMES = 5
 LAST_MILLISECONDS = 1200
 """The end is what counts: it stays."""
 RESTORE = "put the cell's files beside the database; its numbers are all here"
+
+
+class Preview(NamedTuple):
+    """A task in motion, before anything is learned."""
+
+    gif: bytes
+    caption: str
+    """what is seen where"""
 
 
 def arrays(artifact: ArtifactRecord) -> dict[str, NDArray[Any]]:
@@ -53,7 +64,33 @@ def arrays(artifact: ArtifactRecord) -> dict[str, NDArray[Any]]:
 
 def animation(settings: TaskSettings, frames: NDArray[Any]) -> bytes:
     """An endless GIF of a few episodes side by side; ``frames`` (K, T+1, C, H, W) uint8."""
-    shown = _side_by_side(_enlarged(settings, frames[:EPISODES]))
+    return _gif(_side_by_side(_enlarged(settings, frames[:EPISODES])))
+
+
+def preview(settings: TaskSettings, drawn: TaskSettings, frames: NDArray[Any]) -> Preview:
+    """One episode of a task: what a learner sees, pixel by pixel, and beside it what people do.
+
+    ``drawn`` is the same task as `drawable` has it, and ``frames`` (T+1, C, H, W) uint8 are its.
+    """
+    seen, people = settings.observation, _enlarged(drawn, frames, PREVIEW_SIDE)[None]
+    if seen.kind == "state":
+        caption = f"for people: a learner sees {counted(seen.width, 'number')}"
+        return Preview(_gif(_side_by_side(people)), caption)
+    panels = _as_seen(frames)
+    factor = people.shape[2] // panels.shape[2]
+    learner = panels.repeat(factor, axis=2).repeat(factor, axis=3)
+    what = f"the {len(panels)} channels that" if len(panels) > 1 else "what"
+    caption = f"{what} a learner sees"
+    if seen.window > 1:
+        caption += f", {seen.window} frames at a time"
+    if np.array_equal(panels, picture(drawn, frames, factor=1)[None]):  # smoother, no more
+        return Preview(_gif(_side_by_side(learner)), caption)
+    both = _side_by_side(np.concatenate([learner, people]))
+    return Preview(_gif(both), f"left: {caption}; right: for people")
+
+
+def _gif(shown: Pictures) -> bytes:
+    """An endless GIF of pictures (T, rows, columns, 3)."""
     # One palette, from frames of the whole episode: nothing flickers.
     some = np.concatenate(shown[:: max(1, len(shown) // PALETTE_FRAMES)])
     palette = Image.fromarray(some).quantize(colors=128)
@@ -88,9 +125,16 @@ def reconstructions(
     return file.getvalue()
 
 
-def _enlarged(settings: TaskSettings, frames: NDArray[Any]) -> Pictures:
+def _enlarged(settings: TaskSettings, frames: NDArray[Any], side: int = SIDE) -> Pictures:
     """Frames (..., C, H, W) as their simulator draws them for people, (..., rows, columns, 3)."""
-    return picture(settings, frames, factor=max(1, -(-SIDE // frames.shape[-2])))
+    return picture(settings, frames, factor=max(1, -(-side // frames.shape[-2])))
+
+
+def _as_seen(frames: NDArray[Any]) -> Pictures:
+    """Frames (T, C, H, W) in colour, (1, T, H, W, 3), or each channel in grey, (C, T, H, W, 3)."""
+    if frames.shape[1] == 3:
+        return np.moveaxis(frames, 1, -1)[None]
+    return np.repeat(np.moveaxis(frames, 1, 0)[..., None], 3, axis=-1)
 
 
 def _side_by_side(pictures: Pictures) -> Pictures:

@@ -14,6 +14,7 @@ from solar_cli.reporting.animation import animation, arrays, reconstructions
 from solar_cli.reporting.compare import Comparison, baseline_of, compare_curves, stands_in
 from solar_cli.reporting.curves import Curve, Problem, SeedCurve
 from solar_cli.reporting.evidence import code_label
+from solar_cli.reporting.latents import latent_space
 from solar_cli.reporting.summary import Summary, duration, summarise, table
 from solar_cli.reporting.tables import Table
 from solar_cli.settings import TaskSettings
@@ -23,6 +24,9 @@ from solar_cli.wording import counted
 
 MEMORY = "peak_memory_bytes"
 """Metric of the training split, where a worker measures it."""
+
+PICTURES = ("animation", "reconstruction", "latents")
+"""Kinds of artifacts that are drawn."""
 
 Artifacts = Mapping[tuple[str, str], ArtifactRecord]
 """(cell, kind) -> file"""
@@ -36,6 +40,7 @@ class Exhibit:
     seed: int
     animation: bytes | None
     reconstruction: bytes | None
+    latents: bytes | None
     damage: tuple[str, ...]
     """why a stored picture is not shown"""
 
@@ -99,7 +104,7 @@ def exhibit(curve: Curve, artifacts: Artifacts) -> Exhibit | None:
     having = [
         seed
         for seed in _by_final_value(curve)
-        if any((seed.record.hash, kind) in artifacts for kind in ("animation", "reconstruction"))
+        if any((seed.record.hash, kind) in artifacts for kind in PICTURES)
     ]
     if not having:
         return None
@@ -116,8 +121,8 @@ def exhibit(curve: Curve, artifacts: Artifacts) -> Exhibit | None:
             damage.append(str(error))
             return None
 
-    pictures = (drawn("animation"), drawn("reconstruction"))
-    return Exhibit(curve.label, record.cell.seed, *pictures, tuple(damage))
+    pictures = {kind: drawn(kind) for kind in PICTURES}
+    return Exhibit(curve.label, record.cell.seed, **pictures, damage=tuple(damage))
 
 
 def _draw(settings: TaskSettings, kind: str, artifact: ArtifactRecord | None) -> bytes | None:
@@ -127,7 +132,10 @@ def _draw(settings: TaskSettings, kind: str, artifact: ArtifactRecord | None) ->
     try:
         if kind == "animation":
             return animation(settings, stored["frames"])
-        return reconstructions(settings, stored["original"], stored["reconstruction"])
+        if kind == "reconstruction":
+            return reconstructions(settings, stored["original"], stored["reconstruction"])
+        space = latent_space(stored["latents"], stored["truth"], stored["names"].tolist())
+        return None if space is None else figures.render(space, "png")
     except (KeyError, ValueError, IndexError) as error:
         raise SolarError(f"{kind} of {artifact.path.name} cannot be drawn: {error}") from error
 

@@ -22,7 +22,7 @@ import pytest
 import torch
 from torch import nn
 
-from solar_cli.control.latent_policy import smooth_noise
+from solar_cli.control.exploration import smooth_noise
 from solar_cli.envs import build_task
 from solar_cli.episodes import roll_out
 from solar_cli.methods.solar import Solar

@@ -107,6 +107,10 @@ def test_looking_at_a_matrix_imports_nothing_heavy(
     assert imported([*told, "--db", str(stored.db)], tmp_path) == {"sqlalchemy", *besides}
 
 
+def test_a_preview_imports_nothing_that_learns(tmp_path: Path) -> None:
+    assert imported(["tasks", "nav", "--preview", "nav.gif"], tmp_path) == {"numpy"}
+
+
 def test_help_is_there_at_once() -> None:
     """Processor time, because that of the clock depends on who else is computing."""
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from solar_cli.control.latent_policy import LatentPolicy, smooth_noise
+from solar_cli.control.exploration import smooth_noise
+from solar_cli.control.latent_policy import LatentPolicy
 from solar_cli.control.linear_gaussian import LinearGaussianPolicy
 from solar_cli.episodes import window_indices
 from solar_cli.models.basis import LatentBasis

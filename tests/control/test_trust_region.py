@@ -57,7 +57,7 @@ def test_one_episode_has_no_error():
 def test_the_first_batch_is_the_best_and_the_one_to_build_upon():
     state = after(10.0)
     assert state.best == state.current == tried(1, 10.0)
-    assert not state.rejected
+    assert not state.rejections
     assert math.isnan(state.kept)
     assert state.step.multiplier == 1.0
 
@@ -66,7 +66,7 @@ def test_a_better_batch_is_the_new_best():
     state = after(10.0, 8.0)
     assert state.best == state.current == tried(2, 8.0)
     assert state.kept == 2.0
-    assert not state.rejected
+    assert not state.rejections
 
 
 def test_a_batch_that_is_worse_by_its_noise_is_built_upon_but_not_the_best():
@@ -75,26 +75,35 @@ def test_a_batch_that_is_worse_by_its_noise_is_built_upon_but_not_the_best():
     assert state.current == tried(2, 11.4)
     assert state.best == tried(1, 10.0)
     assert state.kept == pytest.approx(-1.4)
-    assert not state.rejected
+    assert not state.rejections
 
 
 def test_a_batch_that_is_worse_by_more_is_taken_back():
     state = after(10.0, 11.5)
     assert state.current == state.best == tried(1, 10.0)
-    assert state.rejected
+    assert state.rejections
     assert state.kept == pytest.approx(-1.5)
     assert state.step.multiplier == pytest.approx(0.4)
 
 
 @pytest.mark.parametrize(("tolerance", "taken_back"), [(0.5, True), (2.0, False), ("never", False)])
 def test_the_tolerance_is_in_standard_errors(tolerance, taken_back):
-    assert after(10.0, 11.5, tolerance=tolerance).rejected == taken_back
+    assert after(10.0, 11.5, tolerance=tolerance).rejections == taken_back
 
 
 def test_next_to_nothing_of_what_was_gained_is_tolerated_where_there_is_no_noise():
-    assert not after(100.0, 60.0, 60.7, error=1e-3).rejected
-    assert after(100.0, 60.0, 60.9, error=1e-3).rejected
-    assert after(100.0, 60.0, 60.7, 61.4, error=1e-3).rejected  # of the best, not of the last
+    assert not after(100.0, 60.0, 60.7, error=1e-3).rejections
+    assert after(100.0, 60.0, 60.9, error=1e-3).rejections
+    assert after(100.0, 60.0, 60.7, 61.4, error=1e-3).rejections  # of the best, not of the last
+
+
+def test_each_rejection_in_a_row_widens_the_margin():
+    """One of sqrt 2, then of two and three of it; what is built upon narrows it again."""
+    assert after(10.0, 15.0, 12.9).rejections == 2
+    assert after(10.0, 15.0, 12.8).rejections == 0
+    assert after(10.0, 15.0, 15.0, 14.3).rejections == 3
+    assert after(10.0, 15.0, 15.0, 14.2).current == tried(4, 14.2)
+    assert after(10.0, 15.0, 12.8, 11.5).rejections == 1
 
 
 def test_without_rejection_anything_is_built_upon():
@@ -106,7 +115,7 @@ def test_without_rejection_anything_is_built_upon():
 def test_small_steps_downhill_cannot_lead_away_from_the_best():
     """Each batch is within the noise of the one before, but not of the best."""
     state = after(10.0, 11.0, 12.0)
-    assert state.rejected
+    assert state.rejections
     assert state.current == tried(1, 10.0)
 
 
@@ -114,7 +123,7 @@ def test_what_follows_a_rejection_is_compared_with_what_it_was_built_upon():
     state = after(10.0, 20.0, 9.0)
     assert state.kept == 1.0
     assert state.best == state.current == tried(3, 9.0)
-    assert not state.rejected
+    assert not state.rejections
 
 
 def test_the_best_never_gets_worse_nor_is_it_replaced_by_an_equal():
@@ -218,7 +227,7 @@ def test_a_saved_trust_region_goes_on_as_it_would_have(costs):
     restored = region().restored(torch.load(buffer, weights_only=True))
     for cost in (9.0, 12.0, 30.0):
         left, right = (s.judged(tried(7, cost), 1.0) for s in (state, restored))
-        for name in ("step", "kept", "rejected", "promised", "first"):
+        for name in ("step", "kept", "rejections", "promised", "first"):
             assert str(getattr(left, name)) == str(getattr(right, name)), name
         for name in ("best", "current"):
             one, other = getattr(left, name), getattr(right, name)

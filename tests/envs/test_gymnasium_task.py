@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from solar_cli.envs import build_task, picture
+from solar_cli.envs import build_task, drawable, picture
 from solar_cli.envs.gymnasium_task import Camera
 from solar_cli.episodes import roll_out
 from solar_cli.errors import SolarError, UsageError
@@ -328,6 +328,23 @@ def pendulum(**make):
     task = load_card("inverted-pendulum").task
     parameters = {**task.parameters, "make": {"width": 64, "height": 64, **make}}
     return task.model_copy(update={"horizon": 3, "parameters": parameters})
+
+
+def test_a_state_is_drawn_as_the_environment_renders_it_in_its_proportions():
+    drawn = drawable(card(), 24)  # of 12 rows and 8 columns
+    assert drawn.observation == Observation(kind="image", height=24, width=16, channels=3)
+    moves = np.tile([-1.0, -2.0], (6, 1))
+    seen, shown = rolled(card(), moves), rolled(drawn, moves)
+    red = np.trunc(np.clip(50 * seen.episodes.frames[..., 0].astype(np.float64), 0, 255))
+    np.testing.assert_allclose(shown.episodes.frames[:, :, 0, 12, 7], red)
+    assert (shown.episodes.frames[..., 2, :, 8:] == 200).all()
+
+
+@pytest.mark.filterwarnings("ignore:.*render_mode")
+@pytest.mark.parametrize(("name", "why"), [("Blind", "renders no images"), ("Bare", "cannot make")])
+def test_a_state_that_nothing_renders_is_not_drawn(name, why):
+    with pytest.raises(UsageError, match=why):
+        drawable(card(f"Test/{name}-v0"))
 
 
 def test_an_image_is_what_the_environment_renders():

@@ -5,9 +5,9 @@ import sys
 
 import numpy as np
 import pytest
-from drawing import skip_if_it_cannot_be_drawn
+from drawing import lacking, skip_if_it_cannot_be_drawn
 
-from solar_cli.envs import SIMULATORS, build_task
+from solar_cli.envs import SIMULATORS, build_task, drawable, picture
 from solar_cli.envs.task import RowTask
 from solar_cli.settings import card_names, load_card
 
@@ -154,6 +154,21 @@ def test_rows_that_start_anew_leave_the_others_alone(settings):
         assert np.array_equal(frames[which], fresh_frames)
         assert np.array_equal(costs[which], fresh_costs)
         assert np.array_equal(frames[[1, 3]], whole[step][0][[1, 3]])
+
+
+def test_what_is_drawn_of_a_task_is_that_task(settings):
+    if settings.simulator == "gymnasium" and lacking():
+        pytest.skip(lacking())
+    drawn = drawable(settings, 36)
+    moves = actions(settings, 2, 3)
+    one, two = (run(build_task(which), streams(2), moves) for which in (settings, drawn))
+    for (_, c1, m1, t1), (frames, c2, m2, t2) in zip(one, two, strict=True):
+        assert frames.shape == (2, *drawn.observation.frame_shape)
+        assert picture(drawn, frames, 2).shape == (2, *(2 * s for s in frames.shape[2:]), 3)
+        assert (c1 is None and c2 is None) or np.array_equal(c1, c2)
+        assert all(np.array_equal(m1[name], m2[name]) for name in m1 | m2)
+        assert np.array_equal(t1, t2)
+    assert (drawn is settings) == (settings.observation.kind == "image")
 
 
 def test_simulators_need_no_heavy_package():

@@ -121,5 +121,9 @@ class Fake:
     def diagnose(self, evaluation: Evaluation) -> dict[str, float]:
         return {"frames": float(evaluation.episodes.frames.mean())}
 
+    def encode(self, episodes: Episodes) -> NDArray[Any] | None:
+        count, times, *frame = episodes.frames.shape
+        return features(episodes.frames.reshape(-1, 1, *frame)).reshape(count, times, 3)
+
     def reconstruct(self, episodes: Episodes) -> NDArray[Any] | None:
         return episodes.frames

@@ -169,6 +169,7 @@ def test_a_kill_around_a_commit_changes_no_bit(
     assert {artifact.kind for artifact in store.artifacts(cell.hash)} == {
         "animation",
         "reconstruction",
+        "latents",
     }
 
 

@@ -255,6 +255,7 @@ def test_diagnosis_is_of_the_newest_latents(tmp_path, monkeypatch):
     evaluation = evaluate(build_task(task), task, run.learner.policy, 20, Streams(5))
     assert run.learner.diagnose(evaluation) == {}
     assert run.learner.reconstruct(evaluation.episodes) is None
+    assert run.learner.encode(evaluation.episodes) is None
     run.iterate(1, 1)
     truth = torch.from_numpy(evaluation.truth)
     mixing = torch.as_tensor(np.random.default_rng(0).normal(size=(4, 4)))
@@ -280,3 +281,7 @@ def test_a_trained_method_shows_what_it_sees(tmp_path, name):
     found = run.learner.reconstruct(episodes[:2])
     assert found.shape == episodes.frames[:2].shape
     assert found.dtype == np.uint8
+    latents = run.learner.encode(episodes[:2])
+    one = run.learner.representation.encode(episodes.frames[1, 3][None])[0].numpy()
+    assert latents.shape == (2, 7, 4)
+    np.testing.assert_allclose(latents[1, 3], one, atol=1e-5)

@@ -37,6 +37,7 @@ def test_evaluating_never_once_or_ten_times_gives_the_same_policies(tmp_path, na
                 streams = Streams(0).under("evaluation", iteration, number)
                 evaluation = evaluate(build_task(task), task, run.learner.policy, 3, streams)
                 run.learner.diagnose(evaluation)
+                run.learner.encode(evaluation.episodes)
                 run.learner.reconstruct(evaluation.episodes)
         found.add((run.bits(), repr(run.metrics)))
     assert len(found) == 1

@@ -93,7 +93,7 @@ def losses_by_attempt(seen: list[float], model_of):
 
 
 def test_a_dead_representation_is_discarded_and_the_next_one_kept():
-    score = Scores(0.1, 0.9)
+    score = Scores(0.05, 0.9)
     model = make(score)
     metrics = model.update(Collected(FIRST))
     first, second = score.states

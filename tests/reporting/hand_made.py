@@ -102,7 +102,7 @@ def compute(
 
 
 def add_pictures(store: Store, of: Cell, attempt: int) -> None:
-    """Three episodes of four frames each, and two reconstructed frames."""
+    """Three episodes of four frames each, two reconstructed frames, and twelve latents."""
     stream = np.random.default_rng(of.seed)
     frames = stream.integers(0, 50, (3, 4, 2, 32, 32), dtype=np.uint8)
     folder = store.folder(of.hash)
@@ -110,6 +110,11 @@ def add_pictures(store: Store, of: Cell, attempt: int) -> None:
     arrays = {
         "animation": {"frames": frames, "kind": np.array("image")},
         "reconstruction": {"original": frames[0, :2], "reconstruction": frames[0, :2] / 2},
+        "latents": {
+            "latents": stream.normal(size=(12, 4)).astype(np.float32),
+            "truth": stream.normal(size=(12, 2)).astype(np.float32),
+            "names": np.array(["x", "y"]),
+        },
     }
     for kind, content in arrays.items():
         np.savez(folder / f"{kind}.npz", allow_pickle=False, **content)

@@ -7,11 +7,22 @@ import pytest
 from hand_made import CARD, add_pictures, cell, compute, database
 from PIL import Image
 
+from solar_cli.envs import build_task, drawable
 from solar_cli.errors import SolarError
-from solar_cli.reporting.animation import GAP, SIDE, animation, arrays, reconstructions
+from solar_cli.reporting.animation import (
+    GAP,
+    SIDE,
+    animation,
+    arrays,
+    preview,
+    reconstructions,
+)
 from solar_cli.reporting.curves import problems
 from solar_cli.reporting.sections import exhibit
+from solar_cli.settings import load_card
 from solar_cli.store.records import Outcome
+
+MOVE = np.array([[5.0, 0.0]])
 
 
 def moving(episodes, steps):
@@ -61,6 +72,61 @@ def test_originals_stand_above_their_reconstructions():
     assert above.min() < 100 < below.min()  # only the upper row shows the dark agent
 
 
+def panels(shown):
+    """Every picture of a preview as its panels, white gaps left out, (T, panels, side, side, 3)."""
+    gif = Image.open(io.BytesIO(shown.gif))
+    pictures = []
+    for frame in range(gif.n_frames):
+        gif.seek(frame)
+        pictures.append(np.asarray(gif.convert("RGB")).astype(int))
+    side = pictures[0].shape[0]
+    starts = range(0, pictures[0].shape[1], side + GAP)
+    return np.array([[whole[:, start : start + side] for start in starts] for whole in pictures])
+
+
+def test_a_preview_shows_each_channel_as_it_is_and_then_a_picture():
+    frames = moving(1, 5)[0]
+    frames[:, 1, 20, 20] = 255
+    shown = preview(CARD.task, CARD.task, frames)
+    assert shown.caption == "left: the 2 channels that a learner sees; right: for people"
+    found = panels(shown)
+    assert found.shape == (5, 3, 256, 256, 3)
+    pixels = frames.repeat(8, axis=2).repeat(8, axis=3)[..., None]
+    np.testing.assert_allclose(found[:, :2], np.broadcast_to(pixels, found[:, :2].shape), atol=12)
+    people = found[:, 2].sum(axis=-1)
+    assert (people[:, 60:196, 60:196].max(axis=(1, 2)) > 700).all()  # paper
+    assert (people.min(axis=(1, 2)) < 250).all()  # and a dark agent
+
+
+def test_a_preview_shows_once_what_is_the_same_for_people_and_learners():
+    settings = load_card("sawyer").task
+    frames = np.zeros((3, 3, 84, 84), np.uint8)
+    frames[:, 0, 10:20, 30:] = 200
+    for step in range(3):  # pictures that are alike would be one, shown for longer
+        frames[step, 2, :40] = 60 * step
+    shown = preview(settings, settings, frames)
+    assert shown.caption == "what a learner sees"
+    found = panels(shown)
+    expected = np.moveaxis(frames, 1, -1).repeat(3, axis=1).repeat(3, axis=2)
+    np.testing.assert_allclose(found[:, 0], expected, atol=3)
+    windowed = load_card("car").task
+    caption = preview(windowed, windowed, frames[:, :1, :64, :64]).caption
+    assert caption == "left: what a learner sees, 4 frames at a time; right: for people"
+
+
+def test_a_preview_of_a_state_is_a_picture_for_people():
+    settings = load_card("car-states").task
+    drawn = drawable(settings, 240)
+    task = build_task(drawn)
+    frames = np.concatenate([task.reset([np.random.default_rng(0)])] + 3 * [task.step(MOVE)[0]])
+    shown = preview(settings, drawn, frames)
+    assert shown.caption == "for people: a learner sees 9 numbers"
+    found = panels(shown)
+    assert found.shape[1:] == (1, 240, 240, 3)
+    assert np.abs(found[0, 0, :120, 120:].astype(int) - 255).max() < 6  # nothing is up there
+    assert found[0, 0, 120:, 120:].min() < 60  # the car starts in the bottom right
+
+
 def test_the_seed_that_is_shown_is_the_one_in_the_middle(tmp_path):
     with database(tmp_path) as store:
         for seed, final in enumerate([0.3, 0.1, 0.2]):
@@ -74,6 +140,7 @@ def test_the_seed_that_is_shown_is_the_one_in_the_middle(tmp_path):
     assert shown.seed == 2
     assert shown.animation
     assert shown.reconstruction
+    assert shown.latents
     assert shown.damage == ()
 
 

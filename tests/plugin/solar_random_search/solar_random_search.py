@@ -107,6 +107,10 @@ class RandomSearch:
         """It has no representation to judge."""
         return {}
 
+    def encode(self, episodes: Episodes) -> NDArray[Any] | None:
+        """It has no latents."""
+        return None
+
     def reconstruct(self, episodes: Episodes) -> NDArray[Any] | None:
         """It has no model of images."""
         return None
