@@ -6,7 +6,7 @@ import torch
 from scipy import stats
 
 from solar_cli.control import task_checks
-from solar_cli.control.latent_policy import smooth_noise
+from solar_cli.control.exploration import smooth_noise
 from solar_cli.control.task_checks import is_stuck, last_action, task_metrics
 from solar_cli.control.trajectories import Trajectories
 from solar_cli.envs.car import STEERING, TARGET, WALL, Car
