@@ -1,6 +1,11 @@
-"""How a sentence counts things."""
+"""How a sentence counts things, and what it leaves out."""
 
 from __future__ import annotations
+
+import re
+
+PASSWORD = re.compile(r"(?<=://)([^/?:@]*:)[^@]*(?=@)|([?&]password=)[^&]*")
+"""in a database's address"""
 
 
 def plural(noun: str, count: int) -> str:
@@ -11,3 +16,8 @@ def plural(noun: str, count: int) -> str:
 def counted(count: int, noun: str) -> str:
     """``1 episode`` or ``2 episodes``."""
     return f"{count} {plural(noun, count)}"
+
+
+def without_password(address: str) -> str:
+    """The address, or a word with it, with ``***`` in the place of a password."""
+    return PASSWORD.sub(lambda found: f"{found[1] or found[2]}***", address)

@@ -10,10 +10,12 @@ from solar_cli.cli.printing import clean, table
 if TYPE_CHECKING:
     from rich.table import Table
 
-SPARE = ("iteration>", "computing>")
+SPARE = ("iteration>", "computing>", "headline measure")
 """Columns that a narrow screen goes without, in this order."""
-CUT = {"variant": 5, "headline measure>": 8}
-"""Columns whose text is cut next, in this order, and the width below which they are left out."""
+CUT, SHORTEST_CUT = "variant", 5
+"""The column whose text is cut next, and to how much; it is never left out."""
+LAST = "value>"
+"""The column that a screen goes without that is narrower still."""
 NOTE, SHORTEST_NOTE = "note", 10
 """The column that gets what is left, if that is enough to say anything."""
 GAP = 2
@@ -42,11 +44,12 @@ def fitted(columns: Sequence[str], rows: Sequence[Sequence[object]], width: int)
     for name in SPARE:
         if name in widths and excess() > 0:
             del widths[name]
-    for name, least in CUT.items():
-        if name in widths and (over := excess()) > 0:
-            widths[name] -= over
-            if widths[name] < least:
-                del widths[name]
+    whole = widths[CUT]
+    for _ in range(2):
+        room = max(widths[CUT] - excess(), SHORTEST_CUT)
+        widths[CUT] = min(whole, room)
+        if excess() > 0:
+            widths.pop(LAST, None)
     left = -excess() - GAP
     if note and left >= SHORTEST_NOTE:
         widths[NOTE] = min(note, left)

@@ -11,7 +11,7 @@ from solar_cli.experiment.estimates import Estimate
 from solar_cli.experiment.matrix import Action, Plan
 from solar_cli.experiment.scheduler import STOPPED, Result, default_workers
 from solar_cli.store.records import Outcome, State
-from solar_cli.wording import counted
+from solar_cli.wording import counted, without_password
 
 
 def planned(plan: Plan) -> dict[str, Any]:
@@ -185,10 +185,10 @@ def kind(result: Result) -> str:
 
 
 def next_commands(results: Sequence[Result], db: str | None) -> list[str]:
-    """Commands that make sense now, ready to be copied."""
+    """Commands that make sense now, ready to be copied but for a password."""
     import shlex
 
-    where = "" if db is None else f" --db {shlex.quote(clean(db))}"
+    where = "" if db is None else f" --db {shlex.quote(clean(without_password(db)))}"
     missing = [result.plan.cell for result in results if not result.finished]
     done = [result.plan.cell for result in results if result.finished]
     commands = [f"solar show {missing[0].hash[:8]}{where}"] if missing else []

@@ -82,7 +82,8 @@ class Line:
         "iteration>",
         "episodes>",
         "computing>",
-        "headline measure>",
+        "headline measure",
+        "value>",
         "note",
     )
 
@@ -99,9 +100,8 @@ class Line:
             record.iteration,
             record.episodes if record.target is None else f"{record.episodes}/{record.target}",
             duration(record.seconds),
-            ""
-            if self.headline is None
-            else f"{cell.configuration.evaluation.headline} {number(self.headline)}",
+            "" if self.headline is None else cell.configuration.evaluation.headline,
+            number(self.headline),
             self.note(),
         )
 

@@ -32,6 +32,7 @@ def command(
     Example:
       solar show 3f2a
     """
+    from solar_cli.reporting.signs import signs
     from solar_cli.reporting.timing import shares
     from solar_cli.store.store import Store
 
@@ -39,6 +40,7 @@ def command(
         record = store.find(cell)
         headline = record.cell.configuration.evaluation.headline
         curve = store.metrics(hashes=[record.hash], names=[headline], splits=["noise_free"])
+        bad = signs(store, record.hash)
         attempts = store.attempts(record.hash)
         times = shares(store, [record])
         folder = store.folder(record.hash)
@@ -56,6 +58,7 @@ def command(
                 "folder": str(folder),
                 "headline": headline,
                 "curve": [[row["episodes"], row["value"]] for row in curve],
+                "needs_a_look": bad,
                 "configuration": record.cell.config(),
                 "time": [asdict(share) for share in times],
                 "changed": [asdict(line) for line in changed],
@@ -65,6 +68,8 @@ def command(
         )
         return
     _print(record, folder, headline, curve)
+    for line in bad:
+        say(f"needs a look: {line}")
     _print_times(times)
     _print_changed(changed)
     _print_attempts(attempts)

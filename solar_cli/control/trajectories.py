@@ -63,6 +63,15 @@ class Trajectories(NamedTuple):
         """Time steps that at least half of the episodes lived."""
         return int((2 * self.live.sum(dim=0) >= len(self.live)).sum())
 
+    @property
+    def noisy(self) -> Bool[Tensor, " N"]:
+        """Episodes whose every action had noise; without it an action is its mean, or clipped."""
+        return ((self.actions != self.action_means).any(dim=-1) | ~self.live).all(dim=1)
+
+    def only(self, episodes: Bool[Tensor, " N"]) -> Trajectories:
+        """Some of the episodes."""
+        return Trajectories(*(part[episodes] for part in self))
+
     def until(self, steps: int) -> Trajectories:
         """The first time steps."""
         first = (part[:, :steps] for part in self[1:])

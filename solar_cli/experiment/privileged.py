@@ -165,9 +165,13 @@ class Privileged(LocalLearner):
         return super().collect(experience)
 
     def linearised(self, region: TrustRegion, states: Trajectories) -> Linearisation:
-        """As the method; line 6 is where the latents of now and the batch built upon are known."""
+        """As the method; line 6 is where the latents of now and the batch built upon are known.
+
+        Rollouts are of the time steps that it is planned for, where episodes end early.
+        """
         if self.given & {Part.DYNAMICS, Part.COST}:
-            self._rollouts = self._rolled_out(region.built_upon.iteration)
+            steps = states.live.shape[1]
+            self._rollouts = self._rolled_out(region.built_upon.iteration).until(steps)
         return super().linearised(region, states)
 
     def infer_dynamics(
@@ -194,10 +198,8 @@ class Privileged(LocalLearner):
     def _rolled_out(self, iteration: int) -> Trajectories:
         """The policy that collected that iteration, batch by batch: frames fill the memory."""
         policy, size = self._tried[iteration], self.settings.batches.noisy
-        batches = [
-            self.embedded(self.world.roll_out(policy, size, iteration, number), [])[0]
-            for number in range(ROLLOUTS)
-        ]
+        rollouts = (self.world.roll_out(policy, size, iteration, k) for k in range(ROLLOUTS))
+        batches = [Trajectories.of(self.representation.embed(one).cpu(), one) for one in rollouts]
         return Trajectories(*(torch.cat(parts) for parts in zip(*batches, strict=True)))
 
 

@@ -17,10 +17,11 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Any
 
+from solar_cli.wording import without_password
+
 PACKAGE = Path(__file__).parent.parent
 DIFF_CHARACTERS = 100_000
 """Longest diff that is stored as text; its hash covers all of it."""
-PASSWORD = re.compile(r"(?<=://)([^\s/:@]*):[^\s/@]*@")
 
 
 def code(package: Path = PACKAGE) -> dict[str, Any]:
@@ -65,7 +66,7 @@ def provenance(device: str) -> dict[str, Any]:
     """All that is stored with an attempt, as plain JSON data."""
     return {
         **code(),
-        "command": PASSWORD.sub(r"\1:***@", shlex.join(sys.argv)),
+        "command": shlex.join(map(without_password, sys.argv)),
         "device": device,
         "python": platform.python_version(),
         "packages": package_versions(),

@@ -20,6 +20,7 @@ from solar_cli.control.local_dynamics import LocalDynamics, infer_dynamics
 from solar_cli.control.lqr import Outcome, PolicyUpdate
 from solar_cli.control.quadratic_cost import FittedCost, fit_quadratic_cost
 from solar_cli.control.step_size import StepSize
+from solar_cli.control.task_checks import task_metrics
 from solar_cli.control.trajectories import Trajectories
 from solar_cli.control.trust_region import Anchor, TrustRegion
 from solar_cli.episodes import Episodes, Evaluation, Experience
@@ -171,6 +172,10 @@ class LocalLearner(ABC):
         return fit_quadratic_cost(
             states, older, self.task.action_cost, self.settings.cost_fit, self.latent
         )
+
+    def checked(self, states: Trajectories, older: list[Trajectories]) -> dict[str, float]:
+        """Whether the task shows the last action, and whether episodes are held somewhere."""
+        return task_metrics(states, older, self.latent, self.task.action_cost)
 
     def adopt(
         self,

@@ -49,6 +49,7 @@ class Solar(LocalLearner):
             **model,
             **dynamics.metrics,
             **cost.metrics,
+            **self.checked(states, older_states),
             "linearisation_residual": previous.residual,
             **self.adopt(region, previous.policy, promised, update, states.reached),
         }

@@ -31,6 +31,7 @@ PALETTE_FRAMES = 5
 """Frames, about, that an animation's colours are taken from."""
 LAST_MILLISECONDS = 1200
 """The end is what counts: it stays."""
+RESTORE = "put the cell's files beside the database; its numbers are all here"
 
 
 class Preview(NamedTuple):
@@ -44,18 +45,21 @@ class Preview(NamedTuple):
 def arrays(artifact: ArtifactRecord) -> dict[str, NDArray[Any]]:
     """The arrays of an ``.npz`` artifact, unpickled never.
 
-    Raises `SolarError` for a file that is missing, or not as it was stored.
+    Raises `SolarError` for a file that is missing, or not as it was stored; without its folder, as
+    a report is made to be passed on.
     """
+    name = f"{artifact.path.name} of cell {artifact.cell[:8]}"
     try:
         content = artifact.path.read_bytes()
         if hashlib.sha256(content).hexdigest() != artifact.sha256:
             raise ValueError("its SHA-256 is not the stored one")
         with np.load(io.BytesIO(content), allow_pickle=False) as stored:
             return {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, EOFError) as error:
-        raise SolarError(
-            f"artifact {artifact.path} is damaged ({error}): `solar run --redo` makes it anew"
-        ) from error
+    except OSError as error:
+        cause = error.strerror or type(error).__name__
+        raise SolarError(f"{name} cannot be read ({cause}): {RESTORE}") from error
+    except (ValueError, EOFError) as error:
+        raise SolarError(f"{name} is damaged ({error}): {RESTORE}") from error
 
 
 def animation(settings: TaskSettings, frames: NDArray[Any]) -> bytes:

@@ -125,14 +125,14 @@ def compare(store: Store, left: str | None = None, right: str | None = None) -> 
     """
     present = code()
 
-    def pair(problem: Problem, one: Curve, other: Curve) -> Pair:
-        said = [*notes(store, one, present), *notes(store, other, present)]
+    def pair(problem: Problem, one: Curve, other: Curve, *more: str) -> Pair:
+        said = [*more, *notes(store, one, present), *notes(store, other, present)]
         return compare_curves(problem, one, other, said)
 
     found = problems(store)
     if left is None:
         pairs = [
-            pair(problem, curve, baseline)
+            pair(problem, curve, baseline, *stands_in(baseline))
             for problem in found
             if (baseline := baseline_of(problem))
             for curve in problem.curves
@@ -160,6 +160,16 @@ def baseline_of(problem: Problem) -> Curve | None:
     """What others are compared with: ``solar``, else the first of its variants."""
     own = [curve for curve in problem.curves if curve.method == BASELINE and "@" not in curve.label]
     return problem.curve(BASELINE) or (own[0] if own else None)
+
+
+def stands_in(baseline: Curve) -> list[str]:
+    """What to know where others are compared with a variant, for want of the default: or nothing.
+
+    Of `baseline_of`; a variant that was asked for stands in for nothing.
+    """
+    if baseline.label == BASELINE:
+        return []
+    return [f"there is no {BASELINE} of the default variant: {baseline.label} stands in for it"]
 
 
 def _known(found: list[Problem], name: str) -> str:

@@ -59,14 +59,19 @@ def notes(store: Store, curve: Curve, present: Mapping[str, Any]) -> list[str]:
             )
         elif record.state is not State.FINISHED:
             lines.append(f"{name} is {record.state.value} at {reached}{cause}")
+    return [f"{curve.label}: {line}" for line in [*lines, *cut(curve)]]
+
+
+def cut(curve: Curve) -> list[str]:
+    """What to know of a curve some seeds of which go on further: a line, or none."""
     longest = max(int(seed.episodes[-1]) for seed in curve.seeds)
-    if longest > curve.end:
-        short = [seed.seed for seed in curve.seeds if seed.end == curve.end]
-        lines.append(
-            f"ends at {curve.end} of {counted(longest, 'episode')}, where its shortest seed ends "
-            f"({ranges(short)})"
-        )
-    return [f"{curve.label}: {line}" for line in lines]
+    if longest <= curve.end:
+        return []
+    short = [seed.seed for seed in curve.seeds if seed.end == curve.end]
+    return [
+        f"ends at {curve.end} of {counted(longest, 'episode')}, where its shortest seed ends "
+        f"({_named(short)})"
+    ]
 
 
 def _code_notes(store: Store, curve: Curve, present: Mapping[str, Any]) -> list[str]:

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from solar_cli.reporting.curves import Curve
+from solar_cli.reporting.signs import SIGNS, TRAIN
 from solar_cli.reporting.statistics import Array
 from solar_cli.reporting.tables import number
 from solar_cli.store.store import Store
 
-SPLITS = ("train", "model")
-ALIVE = "alive"
-"""Metric of a method that judges its own representation: 1, or 0 for a dead or collapsed one."""
+MODEL = "model"
+SPLITS = (TRAIN, MODEL)
 SPARK_WIDTH, SPARK_HEIGHT = 100, 20
 
 
@@ -47,12 +47,13 @@ class Chart:
 
     @property
     def warnings(self) -> list[str]:
-        """One line for each curve with a seed whose method calls its representation unhealthy."""
-        verdicts = dict(self.rows).get(ALIVE, ())
+        """One line for each sign of each curve that a seed has."""
+        rows = dict(self.rows)
         return [
-            f"{label}: the representation of at least one seed is not healthy"
-            for label, vital in zip(self.labels, verdicts, strict=False)
-            if vital is not None and not vital.low >= 1
+            f"{label}: in at least one seed {sign.says}"
+            for sign in SIGNS
+            for label, vital in zip(self.labels, rows.get(_plain(sign.metric), ()), strict=False)
+            if vital is not None and sign.bad(vital.low, vital.high)
         ]
 
 
@@ -78,10 +79,14 @@ def chart(store: Store, curves: Sequence[Curve]) -> Chart:
 
 def _title(name: str, split: str, headlines: Collection[str]) -> str:
     """The headline measure of the learner's own noisy episodes is not the headline: it says so."""
-    plain = name.replace("_", " ")
-    if split == "model":
+    plain = _plain(name)
+    if split == MODEL:
         return f"{plain} (judged on the truth)"
     return f"{plain} ({split})" if name in headlines else plain
+
+
+def _plain(name: str) -> str:
+    return name.replace("_", " ")
 
 
 def _vitals(store: Store, curve: Curve) -> dict[tuple[str, str], Vital]:

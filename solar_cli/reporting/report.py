@@ -14,7 +14,7 @@ from typing import Any
 from solar_cli.errors import SolarError
 from solar_cli.experiment.provenance import code
 from solar_cli.reporting.curves import Problem, problems
-from solar_cli.reporting.evidence import code_label
+from solar_cli.reporting.evidence import code_label, cut
 from solar_cli.reporting.page import page
 from solar_cli.reporting.publishing import publish
 from solar_cli.reporting.sections import MEMORY, Section, cell_lines, origins, section
@@ -31,7 +31,7 @@ class Report:
     paths: tuple[Path, ...]
     """all files, the page among them"""
     lines: tuple[str, ...]
-    """the headline of each curve"""
+    """the headline of each curve, and where one ends before some of its seeds"""
 
 
 def report(store: Store, out: Path) -> Report:
@@ -60,7 +60,15 @@ def report(store: Store, out: Path) -> Report:
     html = page(sections, cell_lines(records, present), origins(records), code_label(present))
     files["index.html"] = html.encode()
     paths = publish(out, files)
-    lines = [line(part.problem, summary) for part in sections for summary in part.summaries]
+    lines = [
+        text
+        for part in sections
+        for curve, summary in zip(part.problem.curves, part.summaries, strict=True)
+        for text in (
+            line(part.problem, summary),
+            *(f"{part.problem.title} {curve.label}: {said}" for said in cut(curve)),
+        )
+    ]
     return Report(out / "index.html", tuple(paths), tuple(lines))
 
 

@@ -11,7 +11,7 @@ from solar_cli.errors import SolarError
 from solar_cli.experiment.matrix import is_stale
 from solar_cli.reporting import figures, health
 from solar_cli.reporting.animation import animation, arrays, reconstructions
-from solar_cli.reporting.compare import Comparison, baseline_of, compare_curves
+from solar_cli.reporting.compare import Comparison, baseline_of, compare_curves, stands_in
 from solar_cli.reporting.curves import Curve, Problem, SeedCurve
 from solar_cli.reporting.evidence import code_label
 from solar_cli.reporting.latents import latent_space
@@ -94,7 +94,8 @@ def _comparison(problem: Problem) -> Table | None:
     others = [curve for curve in problem.curves if curve is not baseline]
     if baseline is None or not others:
         return None
-    pairs = tuple(compare_curves(problem, curve, baseline, []) for curve in others)
+    said = stands_in(baseline)
+    pairs = tuple(compare_curves(problem, curve, baseline, said) for curve in others)
     return next(iter(Comparison(pairs).tables.values()))
 
 

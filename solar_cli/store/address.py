@@ -10,6 +10,7 @@ from sqlalchemy import URL, make_url
 from sqlalchemy.exc import ArgumentError
 
 from solar_cli.errors import UsageError
+from solar_cli.wording import without_password
 
 DEFAULT = "sqlite:///runs/solar.db"
 EXPECTED = "use a file's path, sqlite:///PATH or postgresql://USER@HOST/DATABASE"
@@ -40,7 +41,7 @@ class Location:
 
     def __str__(self) -> str:
         """For messages: the file, or the address without its password."""
-        return str(self.place)
+        return without_password(str(self.place))
 
 
 def locate(address: str | None) -> Location:
@@ -53,13 +54,13 @@ def locate(address: str | None) -> Location:
     text = address or os.environ.get("SOLAR_DB") or DEFAULT
     if "://" not in text:
         return _file(text)
-    scheme, _, rest = text.partition("://")
+    shown, (scheme, _, rest) = without_password(text), text.partition("://")
     if scheme == "sqlite":
         if not rest.startswith("/") or len(rest) == 1:
-            raise UsageError(f"database address {text!r} names no file: {EXPECTED}")
+            raise UsageError(f"database address {shown!r} names no file: {EXPECTED}")
         return _file(rest[1:])
     if scheme not in ("postgresql", "postgres", "postgresql+psycopg"):
-        raise UsageError(f"database address {text!r}: unknown scheme {scheme!r}: {EXPECTED}")
+        raise UsageError(f"database address {shown!r}: unknown scheme {scheme!r}: {EXPECTED}")
     return _server(f"postgresql+psycopg://{rest}")
 
 
@@ -76,8 +77,11 @@ def _server(text: str) -> Location:
     try:
         url = make_url(text)
     except (ArgumentError, ValueError) as error:
-        raise UsageError(f"database address cannot be read ({error}): {EXPECTED}") from error
+        raise UsageError(
+            f"database address cannot be read ({without_password(str(error))}): {EXPECTED}"
+        ) from error
     if not url.database:
-        raise UsageError(f"database address {url} names no database: {EXPECTED}")
+        shown = without_password(str(url))
+        raise UsageError(f"database address {shown} names no database: {EXPECTED}")
     home = os.environ.get("SOLAR_HOME") or f"runs/{url.database}.files"
     return Location(url, Path(home).expanduser().resolve())

@@ -146,6 +146,15 @@ def test_a_password_is_never_printed(solar: Solar) -> None:
         done = solar(*command, "--db", "postgresql://me:hunter2@127.0.0.1:1/solar")
         done.refused("127.0.0.1")
         assert "hunter2" not in done.out + done.err
+    for address in (
+        "mysql://me:hunter2@127.0.0.1/solar",
+        "postgresql://me:hunter2@127.0.0.1:1",
+        "postgresql://me:hunter2@127.0.0.1:port/solar",
+        "postgresql://127.0.0.1:1/solar?user=me&password=hunter2",
+    ):
+        done = solar("status", "--db", address)
+        done.refused("--db" if "?" in address else "address")
+        assert "hunter2" not in done.err
 
 
 def test_a_folder_that_cannot_be_written_is_refused(solar: Solar, tmp_path: Path) -> None:

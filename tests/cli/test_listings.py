@@ -9,6 +9,7 @@ import pytest
 from scenario import Done, Solar, Stored
 from stored_cells import store_attempt
 
+from solar_cli.settings import cells, load_card
 from solar_cli.store.owner import Owner
 from solar_cli.store.records import Metric, Outcome
 from solar_cli.store.store import Store
@@ -28,7 +29,7 @@ def test_status_shows_the_state_of_every_cell(solar: Solar, stored: Stored) -> N
     lines = {line.split()[0]: line for line in done.out.splitlines() if line.strip()}
     for state in ("finished", "stale", "diverged", "failed", "interrupted", "pending"):
         assert state in lines[getattr(stored, state).hash[:8]]
-    assert "final_distance 0.04" in lines[stored.finished.hash[:8]]
+    assert lines[stored.finished.hash[:8]].split()[-2:] == ["final_distance", "0.04"]
     assert "NaN in the ELBO" in lines[stored.diverged.hash[:8]]
     assert "[bold]not bold[/bold]" in done.out  # shown as it is, not as markup
     assert (
@@ -128,6 +129,23 @@ def test_show_works_for_a_cell_in_any_state(solar: Solar, stored: Stored, name: 
     done = solar("show", getattr(stored, name).hash, "--db", stored.db)
     assert (done.code, done.err) == (0, "")
     inert(done)
+
+
+def test_show_says_what_needs_a_look(solar: Solar, stored: Stored) -> None:
+    assert "needs a look" not in solar("show", stored.finished.hash, "--db", stored.db).out
+    with Store.open(str(stored.db)) as store:
+        attempt = store.claim(stored.pending.hash, Owner.current(), 8, {})
+        signs = [Metric("stuck", 1.0), Metric("alive", 1.0)]
+        totals = {"steps": 80, "simulated_seconds": 80.0, "seconds": 5.0}
+        store.commit(stored.pending.hash, attempt, iteration=1, episodes=8, metrics=signs, **totals)
+    [line] = [
+        line
+        for line in solar("show", stored.pending.hash, "--db", stored.db).out.splitlines()
+        if line.startswith("needs a look: ")
+    ]
+    assert "episodes come to rest" in line
+    entry = json.loads(solar("show", stored.pending.hash, "--json", "--db", stored.db).out)
+    assert [f"needs a look: {sign}" for sign in entry["needs_a_look"]] == [line]
 
 
 def test_export_has_one_row_a_metric_in_every_format(
@@ -275,6 +293,24 @@ def test_a_narrow_status_keeps_a_line_a_cell_with_hash_and_state(
         [line] = [line for line in lines if line.startswith(cell.hash[:8])]
         assert state in line.split()
         assert str(cell.seed) in line.split()
+        assert cell.variant in line.split()
+    assert lines[0].split()[-1] in ("value", "note")
+
+
+@pytest.mark.parametrize("width", [80, 70])
+def test_a_narrow_status_cuts_a_long_variant_and_keeps_it(
+    solar: Solar, stored: Stored, monkeypatch: pytest.MonkeyPatch, width: int
+) -> None:
+    [cell] = cells(load_card("inverted-pendulum"), "solar", [0], "smoke", ["task.horizon=9"], "x1")
+    long = cells(load_card("nav"), "solar", [0], "smoke", ["task.horizon=9"], "a-" + "long-" * 9)
+    with Store.open(str(stored.db)) as store:
+        store.add([cell, *long])
+    monkeypatch.setenv("COLUMNS", str(width))
+    lines = solar("status", "--db", stored.db).out.splitlines()
+    assert max(map(len, lines)) <= width
+    for one, shown in ((cell, "x1"), (long[0], "a-lo")):
+        [line] = [line for line in lines if line.startswith(one.hash[:8])]
+        assert line.split()[3].startswith(shown)
 
 
 def test_a_bad_card_does_not_hide_the_others(solar: Solar, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from scenario import Solar, Stored
 from stored_cells import store_attempt
 
 from solar_cli.cli import progress
+from solar_cli.cli.plans import print_results
 from solar_cli.experiment import scheduler
 from solar_cli.experiment.matrix import Action, Plan
 from solar_cli.experiment.messages import Message
@@ -231,6 +232,16 @@ def test_the_next_step_after_an_interruption_keeps_what_was_computed(
     assert second.endswith("--seeds 1,")
     lost = (Outcome.INTERRUPTED, "checkpoints are missing or damaged")
     assert steps([lost], "--budget", "99")[0].startswith("once the cause is put right, the same")
+
+
+def test_the_next_step_tells_no_password(capsys: pytest.CaptureFixture[str]) -> None:
+    [plan] = plans(1)
+    for outcome in (Outcome.FINISHED, Outcome.FAILED):
+        results = [Result(plan, outcome, "")]
+        print_results(results, False, "postgresql://me:hunter2@host/solar")
+        out = capsys.readouterr().out
+        assert f"solar show {plan.cell.hash[:8]} --db 'postgresql://me:***@host/solar'" in out
+        assert "hunter2" not in out
 
 
 def test_a_cell_of_another_run_is_said_to_be_awaited(solar: Solar, stored: Stored) -> None:

@@ -53,10 +53,15 @@ class Watched:
     """A privileged learner at work, with what its observer rolled out and what it fitted."""
 
     def __init__(
-        self, folder: Path, monkeypatch: pytest.MonkeyPatch, cell: Cell, *given: Part
+        self,
+        folder: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        cell: Cell,
+        *given: Part,
+        wrap: Callable[[Any], Any] = lambda task: task,
     ) -> None:
         task, configured = cell.configuration.task, cell.configuration.method
-        simulator, other = build_task(task), build_task(task)
+        simulator, other = wrap(build_task(task)), wrap(build_task(task))
         if Part.STATE in given:
             task, configured = of_positions(task, configured, 4)
             simulator, other = seen_whole(simulator), seen_whole(other)
@@ -257,6 +262,44 @@ def test_with_everything_known_the_model_is_the_simulator(
     predicted = torch.einsum("tij,ntj->nti", dynamics.F, x) + dynamics.f
     torch.testing.assert_close(predicted, states.z[:, 1:], rtol=0.0, atol=1e-5)
     assert r2(cost, states) > 0.999
+
+
+class Ending:
+    """A task that is over at a step of each episode's own: the second to the last."""
+
+    def __init__(self, task: Any) -> None:
+        self._task = task
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._task, name)
+
+    def reset(self, streams: Any) -> Any:
+        frames = self._task.reset(streams)
+        self._step, self._last = 0, 2 + (1000 * self._task.truth()[:, 0]).astype(int) % 5
+        return frames
+
+    def step(self, actions: Any) -> Any:
+        self._step += 1
+        return self._task.step(actions)
+
+    def ended(self) -> Any:
+        return self._step >= self._last
+
+
+@pytest.mark.parametrize("given", [{Part.DYNAMICS}, {Part.COST}, set(Part)])
+def test_rollouts_of_episodes_that_end_early_are_of_the_steps_that_are_planned_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: set[Part]
+) -> None:
+    cell = small("solar", 'methods.solar.update.reject="never"')
+    run = Watched(tmp_path, monkeypatch, cell, *given, wrap=Ending).iterate(3)
+    assert {int(length) for batch in run.observed for length in batch.lengths} == {2, 3, 4, 5, 6}
+    planned = []
+    for iteration, (previous, dynamics, cost, *_) in enumerate(run.updates, start=1):
+        lengths = np.sort(run.environment.collected(iteration).lengths)
+        planned.append(int(lengths[-2]))
+        assert len(previous.k) == len(dynamics.F) == planned[-1]
+        assert len(cost.C) == planned[-1] + 1
+    assert min(planned) < 6  # some batch has not lived as long as the rollouts
 
 
 def test_what_is_rolled_out_is_the_policy_that_collected_though_training_went_on(

@@ -86,6 +86,8 @@ def test_a_password_in_the_command_is_not_stored(monkeypatch: pytest.MonkeyPatch
     command = provenance("cpu")["command"]
     assert "secret" not in command
     assert "user:***@host:5432/db" in command
+    monkeypatch.setattr(sys, "argv", ["solar", "run", f"--db={address}", "--label", "me@home"])
+    assert provenance("cpu")["command"].endswith("user:***@host:5432/db' --label me@home")
 
 
 def test_versions_are_known_without_importing_the_packages() -> None:

@@ -225,6 +225,27 @@ def test_metrics_are_named_finite_numbers(tmp_path, name):
     assert watched <= set(run.metrics[1])
 
 
+# Checks of the task
+
+
+@both
+def test_checks_of_the_task_are_stored_and_change_nothing(tmp_path, monkeypatch, name):
+    run = Run(tmp_path / "with", name).iterate(1, 2)
+    for metrics in run.metrics:
+        assert {"last_action_p_value", "action_seen_late", "stuck"} <= set(metrics)
+    monkeypatch.setattr(local, "task_metrics", lambda *_: {})
+    assert Run(tmp_path / "without", name).iterate(1, 2).bits() == run.bits()
+
+
+def test_what_is_built_upon_and_older_batches_are_checked(tmp_path, monkeypatch):
+    calls = spied(monkeypatch, "task_metrics")
+    run = Run(tmp_path, "solar", costs=of_iteration(2, lambda costs: costs + 1e3)).iterate(1, 2)
+    newest, older, latent, action_cost = calls[1]
+    np.testing.assert_array_equal(newest.costs, run.environment.collected(1).costs)  # 2 is rejected
+    np.testing.assert_array_equal(older[0].costs, run.environment.collected(2).costs)
+    assert (latent, action_cost) == (4, run.configuration.task.action_cost)
+
+
 # Diagnosing
 
 

@@ -160,5 +160,10 @@ def test_a_damaged_or_missing_file_is_said_and_the_rest_is_shown(tmp_path):
         assert shown.reconstruction
         assert "SHA-256" in shown.damage[0]
         path.unlink()
-        with pytest.raises(SolarError, match="damaged"):
+        with pytest.raises(SolarError, match="No such file") as missing:
             arrays(artifacts[of.hash, "animation"])
+        # The cell is finished: its numbers must not be discarded for the sake of a picture.
+        for said in (shown.damage[0], str(missing.value)):
+            assert f"animation.npz of cell {of.hash[:8]}" in said
+            assert "--redo" not in said
+            assert str(tmp_path) not in said

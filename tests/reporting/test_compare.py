@@ -81,6 +81,11 @@ def test_bare_every_method_and_variant_is_compared_with_solar(tmp_path):
     ]
     assert [(p.left.label, p.right.label) for p in single.pairs] == [("vae", "solar")]
     assert [p.problem for p in smoke.pairs] == ["nav:smoke"]
+    # Where there is no default solar, what stands in is said; not what was asked for.
+    plain, _, stood_in = (" ".join(p.notes) for p in found.pairs)
+    assert "there is no solar of the default variant: solar:smoke stands in for it" in stood_in
+    assert "stands in" not in plain + " ".join(smoke.pairs[0].notes)
+    assert "solar:smoke stands in for it" in found.to_markdown()
 
 
 def test_exports_say_the_same_and_json_is_strict(tmp_path):

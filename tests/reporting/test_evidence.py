@@ -3,7 +3,7 @@
 from hand_made import CODE, DIRTY_CODE, OTHER_CODE, cell, compute, curve, database, record, seed
 
 from solar_cli.reporting.curves import problems
-from solar_cli.reporting.evidence import codes, notes
+from solar_cli.reporting.evidence import codes, cut, notes
 from solar_cli.reporting.summary import seeds, summarise, table
 from solar_cli.store.records import Outcome, Owner, State
 
@@ -47,7 +47,8 @@ def test_diverged_failed_unfinished_and_missing_seeds_are_each_said():
 def test_a_curve_cut_by_a_short_seed_says_which():
     text = said(seed(0, [*POINTS, (20, 0.1)]), seed(1, POINTS))
     assert "ends at 10 of 20 episodes" in text
-    assert "(1)" in text
+    assert "(seed 1)" in text
+    assert cut(curve(seed(0, POINTS), seed(1, POINTS))) == []
 
 
 def test_an_attempt_of_other_code_is_not_forgotten_when_a_later_one_finishes(tmp_path):

@@ -1,10 +1,12 @@
 """Vitals: each seed's newest value, and nothing that is not finite is hidden."""
 
 import numpy as np
+import pytest
 from hand_made import cell, compute, database
 
 from solar_cli.reporting.curves import problems
 from solar_cli.reporting.health import chart, spark
+from solar_cli.reporting.signs import signs
 
 
 def test_vitals_are_the_newest_values_over_seeds(tmp_path):
@@ -37,7 +39,32 @@ def test_a_representation_that_its_method_calls_unhealthy_is_warned_of(tmp_path)
         compute(store, cell("vae"), [1.0, 0.5], train={"alive": [1.0]})
         (problem,) = problems(store)
         shown = chart(store, problem.curves)
-    assert shown.warnings == ["solar: the representation of at least one seed is not healthy"]
+    assert shown.warnings == ["solar: in at least one seed the representation is not healthy"]
+
+
+@pytest.mark.parametrize(
+    ("metric", "healthy", "bad", "says"),
+    [
+        ("alive", 1.0, 0.0, "representation is not healthy"),
+        ("action_seen_late", 0.0, 1.0, "an earlier action but not the last one"),
+        ("stuck", 0.0, 1.0, "come to rest where they cost more"),
+        ("clipped", 0.5, 0.51, "at the card's bound"),
+    ],
+)
+def test_a_sign_is_told_by_the_newest_value_of_any_seed(tmp_path, metric, healthy, bad, says):
+    with database(tmp_path) as store:
+        every = [cell(seed=0), cell(seed=1), cell("vae")]
+        for one, values in zip(every, ([healthy], [healthy, bad], [bad, healthy]), strict=True):
+            compute(store, one, [1.0, 0.5, 0.4], train={metric: values, "kl": [1.0, 1.0]})
+        (problem,) = problems(store)
+        (warning,) = chart(store, problem.curves).warnings
+        assert warning.startswith("solar: in at least one seed ")
+        assert says in warning
+        (sign,) = signs(store, every[1].hash)
+        assert warning.endswith(sign)
+        assert signs(store, every[0].hash) == signs(store, every[2].hash) == []
+        compute(store, cell(seed=2), [1.0, 0.5], train={metric: [np.nan]})
+        assert signs(store, cell(seed=2).hash) == [sign]  # what is no number is not healthy
 
 
 def test_the_headline_of_noisy_episodes_is_told_from_the_headline(tmp_path):

@@ -1,6 +1,7 @@
 """A whole report on a real small database."""
 
 import csv
+import shutil
 from html.parser import HTMLParser
 
 import pytest
@@ -84,6 +85,47 @@ def test_the_headline_lines_say_measure_episodes_seeds_and_code(made):
     assert solar.startswith("nav solar: final_distance 0.3 ± 0.1 ")
     assert "after 20 episodes, seeds: 3, code: " in solar
     assert "seeds: 3 (1 diverged), code: bbbbbbb" in vae
+
+
+def test_a_curve_that_a_seed_has_just_begun_to_cut_is_told_of_where_it_is_printed(tmp_path):
+    with database(tmp_path) as store:
+        for seed in (0, 1):
+            compute(store, cell("solar", seed), [1.0, 0.6, 0.2])
+        whole = report(store, tmp_path / "out").lines
+        compute(store, cell("solar", 2), [1.0], None)
+        headline, said = report(store, tmp_path / "out").lines
+    assert len(whole) == 1
+    assert "after 0 episodes, seeds: 3 (1 unfinished)" in headline
+    ends = "ends at 0 of 20 episodes, where its shortest seed ends (seed 2)"
+    assert said == f"nav solar: {ends}"
+    assert f"solar: {ends}" in (tmp_path / "out" / "index.html").read_text()
+
+
+def test_a_report_without_the_files_of_the_cells_keeps_its_numbers(tmp_path):
+    with database(tmp_path) as store:
+        of = cell("solar", 0)
+        attempt = compute(store, of, [1.0, 0.6], None)
+        add_pictures(store, of, attempt)
+        store.end(of.hash, attempt, Outcome.FINISHED)
+        shutil.rmtree(store.home / "cells")
+        (headline,) = report(store, tmp_path / "out").lines
+    text = (tmp_path / "out" / "index.html").read_text()
+    assert "final_distance 0.6" in headline
+    assert "put the cell&#39;s files beside the database" in text
+    assert "--redo" not in text
+    assert str(tmp_path) not in text
+
+
+def test_the_page_says_what_stands_in_for_the_default_solar(tmp_path):
+    with database(tmp_path) as store:
+        compute(store, cell("solar", 0, "fine-tuned"), [1.0, 0.6])
+        compute(store, cell("vae", 0), [1.0, 0.6])
+        report(store, tmp_path / "out")
+        page = (tmp_path / "out" / "index.html").read_text()
+        assert "solar:fine-tuned stands in for it" in page
+        compute(store, cell("solar", 0), [1.0, 0.6])
+        report(store, tmp_path / "out")
+        assert "stands in" not in (tmp_path / "out" / "index.html").read_text()
 
 
 def test_evaluations_hold_every_point_with_all_digits(made):
