@@ -23,7 +23,7 @@ engine = LocalEngine([sys.executable, str(worker)]) if os.environ["DIE"] else Lo
 wanted = cells(load_card(task), "solar", range(int(seeds)), "smoke", [*SETS, *sets], "kills")
 with Store.open(database) as store:
     results = run(
-        plan(store, wanted, 16 if task == "nav" else "desk"),  # three iterations
+        plan(store, wanted, "desk"),  # three iterations
         store,
         engine=engine,
         workers=2,
