@@ -13,9 +13,9 @@ import os
 import warnings
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,14 @@ class Policy(Protocol):
         """Actions (N, a) for windows (N, W, *frame) at step ``t``, their means, the state."""
 
 
+class Batch(NamedTuple):
+    """Names the episodes of one call of `Environment.collect`."""
+
+    iteration: int
+    call: int
+    """the first of an iteration is 0"""
+
+
 @dataclass(frozen=True)
 class Episodes:
     """Trajectories as batched arrays; each frame is held once, windows are index views."""
@@ -63,6 +71,8 @@ class Episodes:
     """frames an observation holds"""
     lengths: NDArray[np.int64] = None  # type: ignore[assignment]
     """(N,) live steps of each episode; T, the default, where nothing ended early"""
+    batch: Batch | None = None
+    """the call that collected them, all of them; None for any others"""
 
     def __post_init__(self) -> None:
         if self.lengths is None:
@@ -99,6 +109,8 @@ class Episodes:
     @staticmethod
     def joined(parts: Sequence[Episodes]) -> Episodes:
         """All episodes of several batches, in order."""
+        if len(parts) == 1:
+            return parts[0]
         return Episodes(
             np.concatenate([part.frames for part in parts]),
             np.concatenate([part.actions for part in parts]),
@@ -278,7 +290,7 @@ class Environment:
                 [streams.generator("reset", i) for i in range(episodes)],
                 streams.generator("noise") if noisy else None,
             )
-            found = collected.episodes
+            found = replace(collected.episodes, batch=Batch(*key))
             data = _packed(found)
             made = self._described(key, noisy, collected, data)
             # Compared as files: one that another zlib has compressed counts as another, too.
@@ -294,11 +306,19 @@ class Environment:
         """All episodes of one iteration."""
         return Episodes.joined([self._get(e) for e in self._ledger if e["iteration"] == iteration])
 
-    def recent(self, batches: int) -> list[Episodes]:
-        """The episodes of each of the last ``batches`` iterations, this one last."""
-        first = max(1, self.iteration - batches + 1)
-        held = {entry["iteration"] for entry in self._ledger}
-        return [self.collected(i) for i in range(first, self.iteration + 1) if i in held]
+    def batches(self) -> list[Batch]:
+        """All that was collected, oldest first."""
+        return [Batch(int(entry["iteration"]), int(entry["call"])) for entry in self._ledger]
+
+    def batch(self, name: Batch) -> Episodes:
+        """The episodes of one call."""
+        return self._get(self._ledger[self.batches().index(name)])
+
+    def recent(self, iterations: int) -> list[Episodes]:
+        """The batches of the last ``iterations``, in their order."""
+        first = self.iteration - iterations + 1
+        named = [name for name in self.batches() if first <= name.iteration <= self.iteration]
+        return [self.batch(name) for name in named]
 
     def summary(self, iteration: int) -> dict[str, float]:
         """Means over the noisy episodes of an iteration: return, final measures, clipped share."""
@@ -351,7 +371,9 @@ class Environment:
         if hashlib.sha256(data).hexdigest() != entry["sha256"]:
             return None
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-            return Episodes(**dict(arrays), window=self.settings.observation.window)
+            batch = Batch(int(entry["iteration"]), int(entry["call"]))
+            window = self.settings.observation.window
+            return Episodes(**dict(arrays), window=window, batch=batch)
 
     def _described(
         self, key: tuple[int, int], noisy: bool, collected: Evaluation, data: bytes
@@ -399,6 +421,7 @@ class Experience:
 
     def __init__(self, environment: Environment) -> None:
         self.collect = environment.collect
-        self.collected = environment.collected
+        self.batches = environment.batches
+        self.batch = environment.batch
         self.recent = environment.recent
         self.iteration = environment.iteration

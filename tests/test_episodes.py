@@ -13,6 +13,7 @@ import pytest
 from solar_cli.envs import build_task
 from solar_cli.episodes import (
     HELD,
+    Batch,
     Environment,
     Episodes,
     Evaluation,
@@ -339,20 +340,20 @@ def test_a_repeated_iteration_finds_what_it_collected(environment: Environment):
     assert_equal_bits(environment.collect(Pull(gain=0.9), 4), collected)
 
 
-def test_recent_batches_are_one_an_iteration_oldest_first(environment: Environment):
-    batches: dict[int, Episodes] = {}
+def test_recent_batches_are_those_of_the_last_iterations_oldest_first(environment: Environment):
+    batches: dict[int, list[Episodes]] = {}
     for iteration in (1, 2, 3, 4):
         environment.begin(iteration)
-        calls = [environment.collect(Pull(), iteration)]
-        calls.append(environment.collect(Pull(), 1, noisy=False))
-        batches[iteration] = Episodes.joined(calls)
-    for found, expected in zip(environment.recent(2), (batches[3], batches[4]), strict=True):
-        assert_equal_bits(found, expected)
-    assert_equal_bits(environment.collected(2), batches[2])
-    assert [len(batch) for batch in environment.recent(1)] == [5]
-    assert [len(batch) for batch in environment.recent(10)] == [2, 3, 4, 5]
+        batches[iteration] = [environment.collect(Pull(), iteration)]
+        batches[iteration].append(environment.collect(Pull(), 1, noisy=False))
+    expected = [*batches[3], *batches[4]]
+    for found, batch in zip(environment.recent(2), expected, strict=True):
+        assert_equal_bits(found, batch)
+    assert_equal_bits(environment.collected(2), Episodes.joined(batches[2]))
+    assert [len(batch) for batch in environment.recent(1)] == [4, 1]
+    assert [len(batch) for batch in environment.recent(10)] == [1, 1, 2, 1, 3, 1, 4, 1]
     environment.begin(2)  # what was collected later is not there yet
-    assert [len(batch) for batch in environment.recent(2)] == [2, 3]
+    assert [len(batch) for batch in environment.recent(2)] == [1, 1, 2, 1]
 
 
 def test_a_learner_meets_its_experience_and_no_judge(environment: Environment):
@@ -360,9 +361,24 @@ def test_a_learner_meets_its_experience_and_no_judge(environment: Environment):
     experience = Experience(environment)
     collected = experience.collect(Pull(), 4)
     assert experience.iteration == 3
-    assert_equal_bits(experience.collected(3), collected)
+    assert_equal_bits(experience.batch(Batch(3, 0)), collected)
     public = {name for name in dir(experience) if not name.startswith("_")}
-    assert public == {"collect", "collected", "recent", "iteration"}
+    assert public == {"collect", "batches", "batch", "recent", "iteration"}
+
+
+def test_batches_are_found_by_their_names(environment: Environment):
+    calls: dict[Batch, Episodes] = {}
+    for iteration in (1, 2):
+        environment.begin(iteration)
+        for call in (0, 1):
+            calls[Batch(iteration, call)] = environment.collect(Pull(), 1 + call)
+    assert environment.batches() == list(calls)
+    for name, collected in calls.items():
+        found = environment.batch(name)
+        assert_equal_bits(found, collected)
+        assert found.batch == collected.batch == name
+        assert found[:1].batch is None
+        assert Episodes.joined([found, found]).batch is None
 
 
 def test_an_iteration_is_summed_up_over_its_noisy_episodes(environment: Environment):

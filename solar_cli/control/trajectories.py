@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -87,6 +88,11 @@ class Trajectories(NamedTuple):
             torch.from_numpy(episodes.costs),
             torch.from_numpy(episodes.live_steps),
         )
+
+    @staticmethod
+    def joined(parts: Sequence[Trajectories]) -> Trajectories:
+        """All episodes of several batches, in order."""
+        return Trajectories(*(torch.cat(part) for part in zip(*parts, strict=True)))
 
     def transitions(self, d: int) -> Transitions:
         """Regressors and increments of the newest block of d entries."""

@@ -17,7 +17,7 @@ from solar_cli.control.linear_gaussian import (
     expected_cost,
 )
 from solar_cli.control.step_size import StepSize
-from solar_cli.episodes import Episodes
+from solar_cli.episodes import Batch, Episodes
 
 LEAST_PROMISE = 0.05
 """Share of what has been gained so far below which an update is tried before it is handed over: a
@@ -31,9 +31,10 @@ episodes hardly differ, their noise is so small that nothing would ever be built
 
 
 class Anchor(NamedTuple):
-    """A policy that was tried, the iteration that holds its episodes, and what they cost."""
+    """A policy that was tried, where its episodes are, and what they cost."""
 
-    iteration: int
+    batches: tuple[Batch, ...]
+    """oldest first"""
     gains: LinearGaussianPolicy
     cost: float
     """mean of the sum over an episode"""
@@ -41,11 +42,20 @@ class Anchor(NamedTuple):
     """its standard error"""
 
     @staticmethod
-    def of(iteration: int, gains: LinearGaussianPolicy, episodes: Episodes) -> Anchor:
-        """Judge a batch by the cost of its episodes."""
+    def of(batch: Batch, gains: LinearGaussianPolicy, episodes: Episodes) -> Anchor:
+        """Judge a policy by the cost of a batch of its episodes."""
         totals = episodes.costs.sum(axis=1)
         error = totals.std(ddof=1) / math.sqrt(len(totals)) if len(totals) > 1 else 0.0
-        return Anchor(iteration, gains, float(totals.mean()), float(error))
+        return Anchor((batch,), gains, float(totals.mean()), float(error))
+
+    @property
+    def iteration(self) -> int:
+        """The first that collected its episodes."""
+        return self.batches[0].iteration
+
+    def with_more(self, batch: Batch) -> Anchor:
+        """The same policy with further episodes."""
+        return self._replace(batches=(*self.batches, batch))
 
 
 @dataclass(frozen=True)
@@ -100,6 +110,13 @@ class TrustRegion:
         """What the next update starts from; there is none before a first policy was judged."""
         assert self.current is not None
         return self.current
+
+    def gathered(self, batch: Batch) -> TrustRegion:
+        """Further episodes of the policy that is built upon."""
+        current = self.built_upon.with_more(batch)
+        same = self.best is not None and self.best.batches == self.built_upon.batches
+        best = current if same else self.best
+        return replace(self, current=current, best=best)
 
     def trusts(self, promised: float) -> bool:
         """Whether an update that promises this fall of the cost may be handed over untried.
@@ -166,10 +183,16 @@ def promised_fall(
 def _plain(anchor: Anchor | None) -> dict[str, Any] | None:
     if anchor is None:
         return None
-    return {**anchor._asdict(), "gains": [gain.clone() for gain in anchor.gains]}
+    return {
+        **anchor._asdict(),
+        "batches": [tuple(batch) for batch in anchor.batches],
+        "gains": [gain.clone() for gain in anchor.gains],
+    }
 
 
 def _anchor(state: dict[str, Any] | None) -> Anchor | None:
     if state is None:
         return None
-    return Anchor(**{**state, "gains": LinearGaussianPolicy(*state["gains"])})
+    batches = tuple(Batch(*batch) for batch in state["batches"])
+    gains = LinearGaussianPolicy(*state["gains"])
+    return Anchor(**{**state, "batches": batches, "gains": gains})

@@ -18,7 +18,7 @@ from solar_cli.control.linearise import Linearisation
 from solar_cli.control.local_dynamics import LocalDynamics, infer_dynamics
 from solar_cli.control.quadratic_cost import FittedCost, fit_quadratic_cost
 from solar_cli.control.trajectories import Trajectories
-from solar_cli.control.trust_region import Anchor, TrustRegion
+from solar_cli.control.trust_region import TrustRegion
 from solar_cli.envs import Task
 from solar_cli.envs.task import Floats, Frames
 from solar_cli.episodes import Episodes, Experience, Policy, roll_out
@@ -115,9 +115,11 @@ class TrueState(Representation):
         """The basis from the first batch, and the prior's factors from the last ones."""
         recent = experience.recent(self.settings.training.buffer)
         if not self._trained:
-            first = torch.from_numpy(recent[-1].frames).flatten(0, 1).to(self.device)
-            self._model.networks.standardise_by(first)
-            self._basis = self._whitening(recent[-1])
+            first = np.concatenate([episodes.frames for episodes in recent])
+            self._model.networks.standardise_by(
+                torch.from_numpy(first).flatten(0, 1).to(self.device)
+            )
+            self._basis = self._whitening(recent)
             self._trained, self.moved_in = True, experience.iteration
         self._conclude(recent)
         return self._model.prior.metrics()
@@ -154,7 +156,7 @@ class Privileged(LocalLearner):
             self.pulse,
         )
 
-    def collect(self, experience: Experience) -> Anchor:
+    def collect(self, experience: Experience) -> TrustRegion:
         """As the method; the policy is kept, with the representation that it acts on."""
         frozen = self.make_representation()
         frozen.load_state_dict(self.representation.state_dict())
@@ -200,7 +202,7 @@ class Privileged(LocalLearner):
         policy, size = self._tried[iteration], self.settings.batches.noisy
         rollouts = (self.world.roll_out(policy, size, iteration, k) for k in range(ROLLOUTS))
         batches = [Trajectories.of(self.representation.embed(one).cpu(), one) for one in rollouts]
-        return Trajectories(*(torch.cat(parts) for parts in zip(*batches, strict=True)))
+        return Trajectories.joined(batches)
 
 
 def privileged(

@@ -167,6 +167,8 @@ def prepare_torch(device: str) -> str:
     torch.use_deterministic_algorithms(True)
     # Else every new tensor is filled with NaN first: a twentieth of a training.
     torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
+    # A GPU's convolutions round to 10 bits unless told not to, and learn something else.
+    torch.backends.cudnn.allow_tf32 = False
     available = torch.cuda.is_available()
     if device == "cuda" and not available:
         raise SolarError(

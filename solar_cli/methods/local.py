@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import replace
+from itertools import chain, groupby
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from solar_cli.control.step_size import StepSize
 from solar_cli.control.task_checks import task_metrics
 from solar_cli.control.trajectories import Trajectories
 from solar_cli.control.trust_region import Anchor, TrustRegion
-from solar_cli.episodes import Episodes, Evaluation, Experience
+from solar_cli.episodes import Batch, Episodes, Evaluation, Experience
 from solar_cli.models.diagnostics import latent_metrics
 from solar_cli.models.priors import LatentPrior, Prior
 from solar_cli.models.representation import Representation
@@ -31,6 +32,9 @@ from solar_cli.pulse import Diverged, Pulse
 from solar_cli.settings import TaskSettings
 from solar_cli.settings.local import LocalMethod
 from solar_cli.streams import Streams
+
+MOST_BATCHES = 4
+"""of the policy that is built upon, newest first"""
 
 
 class LocalLearner(ABC):
@@ -106,44 +110,72 @@ class LocalLearner(ABC):
             return None
         return step * steps * region.step.multiplier
 
-    def collect(self, experience: Experience) -> Anchor:
-        """Line 4: episodes of the current policy, judged without noise where the card says so."""
+    def collect(self, experience: Experience) -> TrustRegion:
+        """Line 4: what to build upon, and episodes of it.
+
+        Where the card has episodes without noise, they come first and judge the newest policy. If
+        it is worse than the best, the noisy ones are further episodes of the best.
+        """
         batches = self.settings.batches
-        count = batches.initial if experience.iteration == 1 else batches.noisy
+        noisy = batches.initial if experience.iteration == 1 else batches.noisy
         newest = self._acting(self.gains)
-        judged = experience.collect(newest, count)
-        if batches.noise_free:
-            judged = experience.collect(newest, batches.noise_free, noisy=False)
-        if not np.isfinite(judged.costs).all():
+        if not batches.noise_free:
+            return self._judged(experience, experience.collect(newest, noisy))
+        judges = experience.collect(newest, batches.noise_free, noisy=False)
+        region = self._judged(experience, judges)
+        again = self._acting(self._best_of_now(experience, region)) if region.rejections else newest
+        experience.collect(again, noisy)
+        return region.gathered(Batch(experience.iteration, 1))
+
+    def _judged(self, experience: Experience, episodes: Episodes) -> TrustRegion:
+        """What to build upon, after the first episodes of an iteration."""
+        if not np.isfinite(episodes.costs).all():
             raise Diverged(f"a cost of iteration {experience.iteration} is not finite")
-        return Anchor.of(experience.iteration, self.gains, judged)
+        tried = Anchor.of(Batch(experience.iteration, 0), self.gains, episodes)
+        return self.trust_region.judged(tried, self.settings.update.reject)
+
+    def _best_of_now(self, experience: Experience, region: TrustRegion) -> LinearGaussianPolicy:
+        """The policy that is built upon, on the latents of now."""
+        if not self._needs_line_six(region):
+            return region.built_upon.gains
+        states, _ = self.embedded(self.batches(experience, region)[0], [])
+        return self.linearised(region, states).policy.held(states.reached, self.task.horizon)
 
     def batches(
         self, experience: Experience, region: TrustRegion
-    ) -> tuple[Episodes, list[Episodes]]:
-        """The episodes to update from, and other recent ones, newest first."""
-        chosen = region.built_upon.iteration
-        others = [i for i in range(experience.iteration, 0, -1) if i != chosen]
-        others = others[: self.settings.local_fit.older_batches]
-        return experience.collected(chosen), [experience.collected(i) for i in others]
+    ) -> tuple[list[Episodes], list[list[Episodes]]]:
+        """The batches to update from, and those of other iterations, the newest one first."""
+        chosen = region.built_upon.batches[-MOST_BATCHES:]
+        others = [batch for batch in experience.batches() if batch not in chosen]
+        iterations = [list(group) for _, group in groupby(others, lambda batch: batch.iteration)]
+        recent = iterations[::-1][: self.settings.local_fit.older_batches]
+        return (
+            [experience.batch(name) for name in chosen],
+            [[experience.batch(name) for name in group] for group in recent],
+        )
 
     def embedded(
-        self, episodes: Episodes, older: list[Episodes]
+        self, batches: list[Episodes], older: list[list[Episodes]]
     ) -> tuple[Trajectories, list[Trajectories]]:
         """Latent states of episodes, on the CPU: control runs there.
 
         Where episodes ended early, only of the time steps that there is something to plan by.
         """
         newest, *others = (
-            Trajectories.of(self.representation.embed(batch).cpu(), batch)
-            for batch in (episodes, *older)
+            Trajectories.joined([self._embedded(self.representation, one) for one in group])
+            for group in (batches, *older)
         )
         return newest.until(newest.planned), [batch.until(newest.planned) for batch in others]
 
-    def latent_prior(self, older: list[Episodes]) -> LatentPrior:
+    @staticmethod
+    def _embedded(representation: Representation, episodes: Episodes) -> Trajectories:
+        return Trajectories.of(representation.embed(episodes).cpu(), episodes)
+
+    def latent_prior(self, older: list[list[Episodes]]) -> LatentPrior:
         """What the model knows of its dynamics: a source of the prior of line 7."""
         own = self.settings.local_fit.prior_counts == "own"
-        return self.representation.dynamics_prior(older, as_it_stands=own)
+        every = list(chain.from_iterable(older))
+        return self.representation.dynamics_prior(every, as_it_stands=own)
 
     def linearised(self, region: TrustRegion, states: Trajectories) -> Linearisation:
         """Line 6: the policy to improve, in the latents of now.
@@ -151,11 +183,15 @@ class LocalLearner(ABC):
         It acted on the latents from before its iteration's update: that one or a later one may have
         changed them.
         """
-        iteration = region.built_upon.iteration
         gains = region.built_upon.gains.until(states.live.shape[1])
-        if self.representation.moved_in >= iteration and self.settings.update.linearise:
+        if self._needs_line_six(region):
             return linearise_policy(states.z[:, :-1], states.action_means, states.live, gains)
         return Linearisation(gains, residual=0.0, ridge=0.0)
+
+    def _needs_line_six(self, region: TrustRegion) -> bool:
+        """Whether latents have changed since the policy that is built upon first acted."""
+        moved = self.representation.moved_in >= region.built_upon.iteration
+        return moved and self.settings.update.linearise
 
     def infer_dynamics(
         self,
@@ -246,6 +282,6 @@ class LocalLearner(ABC):
         self.trust_region = self.trust_region.restored(state["trust_region"])
         self.updates = state["updates"]
 
-    def _cost_score(self, representation: Representation, episodes: Episodes) -> float:
-        states = Trajectories.of(representation.embed(episodes).cpu(), episodes)
+    def _cost_score(self, representation: Representation, batches: list[Episodes]) -> float:
+        states = Trajectories.joined([self._embedded(representation, one) for one in batches])
         return self.fitted_cost(states, []).r2

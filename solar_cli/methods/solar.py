@@ -25,12 +25,11 @@ class Solar(LocalLearner):
 
     def iterate(self, experience: Experience) -> dict[str, float]:
         """One turn of Algorithm 1 (lines 4 to 8)."""
-        tried = self.collect(experience)  # line 4: N rollouts of the current policy
-        region = self.trust_region.judged(tried, self.settings.update.reject)
-        episodes, older = self.batches(experience, region)
+        region = self.collect(experience)  # line 4: N rollouts of the current policy
+        batches, older = self.batches(experience, region)
 
         model = self.representation.update(experience)  # line 5: MODELUPDATE, section 3
-        states, older_states = self.embedded(episodes, older)
+        states, older_states = self.embedded(batches, older)
 
         previous = self.linearised(region, states)  # line 6: LINEARIZEPOLICY, appendix C
         dynamics = self.infer_dynamics(  # line 7: INFERDYNAMICS, section 4.1 and appendix B

@@ -6,6 +6,7 @@ p = W d + a + 1 regressors (the constant 1 gives the dynamics an affine term), T
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -40,6 +41,19 @@ class Segments(NamedTuple):
         if self.live is None:
             return part.flatten(0, 1)
         return part[self.live[:, self.live.shape[1] - part.shape[1] :]]
+
+    @staticmethod
+    def joined(parts: Sequence[Segments]) -> Segments:
+        """Those of several batches of whole episodes."""
+        masks = [
+            torch.ones_like(part.mean[..., 0], dtype=torch.bool) if part.live is None else part.live
+            for part in parts
+        ]
+        mean, variance, actions, start = (
+            torch.cat(field) for field in zip(*(part[:4] for part in parts), strict=True)
+        )
+        whole = all(part.live is None for part in parts)
+        return Segments(mean, variance, actions, start, None if whole else torch.cat(masks))
 
 
 class LatentPrior(NamedTuple):

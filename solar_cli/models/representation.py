@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from solar_cli.episodes import Episodes, Experience, window_indices
+from solar_cli.episodes import Batch, Episodes, Experience, window_indices
 from solar_cli.errors import UsageError
 from solar_cli.inference import mniw
 from solar_cli.models.basis import LatentBasis
@@ -35,7 +35,7 @@ LEAST_EXPLAINED = 0.4  # of the variance of each channel; a dead one has next to
 LEAST_COST_R2 = 0.1
 JUDGED_FRAMES = 600  # decoded at most to judge a batch: bounds memory
 
-CostScore = Callable[["Representation", Episodes], float]
+CostScore = Callable[["Representation", list[Episodes]], float]
 """R2 of the cost that control would fit on them, each episode left out once."""
 
 
@@ -81,6 +81,7 @@ class Representation:
         self._trained = False
         self._before: Candidate | None = None  # what a fine-tuning under way started from
         self._candidates: list[Candidate] = []
+        self._latents: dict[Batch, Segments] = {}  # of the networks as they are
 
     @property
     def trained(self) -> bool:
@@ -101,7 +102,7 @@ class Representation:
         """
         factor = self._model.prior.factor if as_it_stands else None
         if older and not as_it_stands:
-            factor = self._model.prior.given(self._posterior(Episodes.joined(older)))
+            factor = self._model.prior.given(self._posterior(older))
         if factor is not None:
             factor = mniw.RegressionStatistics(*(part.cpu() for part in factor))
         basis = LatentBasis(*(part.cpu() for part in self.basis))
@@ -119,19 +120,19 @@ class Representation:
 
     def update(self, experience: Experience) -> dict[str, float]:
         """MODELUPDATE (Algorithm 1, line 5): train on the batches of the last B iterations."""
-        recent = experience.recent(self.settings.training.buffer)
+        newest, recent = experience.recent(1), experience.recent(self.settings.training.buffer)
         if not self._trained:
-            metrics = self._train_first(experience.iteration, recent[-1])
+            metrics = self._train_first(experience.iteration, newest)
         elif self.settings.training.fine_tune_steps:
-            metrics = self._fine_tune(experience.iteration, recent)
+            metrics = self._fine_tune(experience.iteration, newest, recent)
         else:
-            metrics = self._judge(recent[-1])
+            metrics = self._judge(newest)
             self._conclude(recent)
         return {**metrics, **self._model.prior.metrics()}
 
-    def _train_first(self, iteration: int, episodes: Episodes) -> dict[str, float]:
+    def _train_first(self, iteration: int, batches: list[Episodes]) -> dict[str, float]:
         """Train until a representation is alive, or take the best of the attempts."""
-        training = self.settings.training
+        training, episodes = self.settings.training, Episodes.joined(batches)
         kept = max(1, round(training.held_out * len(episodes)))
         learned, held_out = episodes[:-kept], episodes[-kept:]
         while len(self._candidates) < training.attempts and not self._found():
@@ -140,10 +141,11 @@ class Representation:
                 self._model = self._untrained(attempt)
                 self._model.networks.standardise_by(self._live_frames(learned))
             name = f"attempt {attempt}"
+            self._latents.clear()
             terms = self._trainer.fit(name, self._model, [learned], training.steps)
-            self._basis = self._whitening(learned)
-            metrics = self._judge(held_out)
-            metrics["held_out_cost_r2"] = self._cost_score(self, episodes)
+            self._basis = self._whitening([learned])
+            metrics = self._judge([held_out])
+            metrics["held_out_cost_r2"] = self._cost_score(self, batches)
             alive = self._alive(metrics) and metrics["held_out_cost_r2"] >= LEAST_COST_R2
             self._candidates.append(Candidate(alive, {**terms, **metrics}, self._parameters()))
         best = max(self._candidates, key=lambda c: (c.alive, c.metrics["held_out_elbo"]))
@@ -167,13 +169,16 @@ class Representation:
     def _found(self) -> bool:
         return any(candidate.alive for candidate in self._candidates)
 
-    def _fine_tune(self, iteration: int, recent: list[Episodes]) -> dict[str, float]:
+    def _fine_tune(
+        self, iteration: int, newest: list[Episodes], recent: list[Episodes]
+    ) -> dict[str, float]:
         """Train further on the last batches; taken back if it kills what was alive."""
-        newest, steps = recent[-1], self.settings.training.fine_tune_steps
+        steps = self.settings.training.fine_tune_steps
         if not self._trainer.under_way or self._before is None:
             self._before = Candidate(True, self._judge(newest), self._parameters())
         before = self._before
         name = f"iteration {iteration}"
+        self._latents.clear()
         terms = self._trainer.fit(name, self._model, recent, steps, fine_tuning=True)
         self._before = None
         kills = self._alive(before.metrics) and not self._alive(self._judge(newest))
@@ -185,7 +190,7 @@ class Representation:
         return {**terms, **before.metrics, "fine_tuning_taken_back": float(kills)}
 
     def _conclude(self, batches: list[Episodes]) -> None:
-        self._model.prior.conclude(self._posterior(Episodes.joined(batches)))
+        self._model.prior.conclude(self._posterior(batches))
 
     @staticmethod
     def _alive(metrics: dict[str, float]) -> bool:
@@ -194,13 +199,14 @@ class Representation:
         return explained and metrics["active_latents"] >= 1
 
     @torch.no_grad()
-    def _judge(self, episodes: Episodes) -> dict[str, float]:
+    def _judge(self, batches: list[Episodes]) -> dict[str, float]:
         """What there is to watch, on collected episodes that the model has not been trained on."""
         model = self._model
-        segments = self._posterior(episodes)
+        segments = self._posterior(batches)
         mean, variance = segments.counted(segments.mean), segments.counted(segments.variance)
         some = slice(None, None, -(-len(mean) // JUDGED_FRAMES))
-        scaled = model.networks.scaled(self._live_frames(episodes)[some])
+        frames = torch.cat([self._live_frames(episodes) for episodes in batches])
+        scaled = model.networks.scaled(frames[some])
         draws = self._streams.generator("judging").standard_normal(mean[some].shape)
         sample = mean[some] + variance[some].sqrt() * torch.from_numpy(draws).to(mean)
         reconstruction = model.networks.reconstruction_loss(sample.float(), scaled)
@@ -218,7 +224,7 @@ class Representation:
     @torch.no_grad()
     def embed(self, episodes: Episodes) -> Float[Tensor, "N T1 z"]:
         """States of every step, by the encoder's mean; each frame is encoded once."""
-        return self.basis.state(self._windows(self._posterior(episodes).mean))
+        return self.basis.state(self._windows(self._posterior([episodes]).mean))
 
     @torch.no_grad()
     def encode(self, frames: np.ndarray[Any, Any]) -> Float[Tensor, "n d"]:
@@ -263,8 +269,16 @@ class Representation:
             networks.to(self.device), self._make_prior(), self.settings.training.standard_normal
         )
 
-    def _posterior(self, episodes: Episodes) -> Segments:
-        return self._model.posterior(episodes, self.device)
+    def _posterior(self, batches: list[Episodes]) -> Segments:
+        """q(z | s) of whole episodes; the same networks encode no collected frame twice."""
+        return Segments.joined([self._posterior_of(episodes) for episodes in batches])
+
+    def _posterior_of(self, episodes: Episodes) -> Segments:
+        if episodes.batch is None:
+            return self._model.posterior(episodes, self.device)
+        if episodes.batch not in self._latents:
+            self._latents[episodes.batch] = self._model.posterior(episodes, self.device)
+        return self._latents[episodes.batch]
 
     def _live_frames(self, episodes: Episodes) -> Float[Tensor, "n *frame"]:
         return torch.from_numpy(episodes.frames[episodes.live_frames]).to(self.device)
@@ -274,8 +288,8 @@ class Representation:
         index = window_indices(latents.shape[1] - 1, self.task.observation.window)
         return latents[:, torch.from_numpy(index[:, ::-1].copy()).to(latents.device)]
 
-    def _whitening(self, episodes: Episodes) -> LatentBasis:
-        segments = self._posterior(episodes)
+    def _whitening(self, batches: list[Episodes]) -> LatentBasis:
+        segments = self._posterior(batches)
         return LatentBasis.whitening(segments.counted(self._windows(segments.mean)))
 
     def _parameters(self) -> dict[str, Any]:
@@ -287,6 +301,7 @@ class Representation:
         return {"networks": networks, "prior": self._model.prior.state_dict(), "basis": basis}
 
     def _take_up(self, parameters: dict[str, Any]) -> None:
+        self._latents.clear()
         self._model.networks.load_state_dict(parameters["networks"])
         self._model.prior.load_state_dict(parameters["prior"])
         basis = parameters["basis"]

@@ -16,13 +16,13 @@ from solar_cli.control.linear_gaussian import (
 )
 from solar_cli.control.step_size import StepSize
 from solar_cli.control.trust_region import Anchor, TrustRegion, promised_fall
-from solar_cli.episodes import Episodes
+from solar_cli.episodes import Batch, Episodes
 
 GAINS = initial_policy(3, 2, 1, 0.5)
 
 
 def tried(iteration: int, cost: float, error: float = 1.0) -> Anchor:
-    return Anchor(iteration, GAINS, cost, error)
+    return Anchor((Batch(iteration, 0),), GAINS, cost, error)
 
 
 def region(**changes) -> TrustRegion:
@@ -40,7 +40,7 @@ def after(*costs: float, tolerance=1.0, error=1.0) -> TrustRegion:
 def test_a_batch_is_judged_by_the_sums_of_its_episodes():
     costs = np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 9.0]])
     zeros = np.zeros((3, 2, 1))
-    anchor = Anchor.of(4, GAINS, Episodes(np.zeros((3, 3, 1)), zeros, zeros, costs))
+    anchor = Anchor.of(Batch(4, 0), GAINS, Episodes(np.zeros((3, 3, 1)), zeros, zeros, costs))
     assert anchor.iteration == 4
     assert anchor.gains is GAINS
     assert anchor.cost == pytest.approx((3 + 7 + 14) / 3)
@@ -51,7 +51,7 @@ def test_a_batch_is_judged_by_the_sums_of_its_episodes():
 def test_one_episode_has_no_error():
     zeros = np.zeros((1, 2, 1))
     episodes = Episodes(np.zeros((1, 3, 1)), zeros, zeros, np.ones((1, 2)))
-    assert Anchor.of(1, GAINS, episodes) == Anchor(1, GAINS, 2.0, 0.0)
+    assert Anchor.of(Batch(1, 0), GAINS, episodes) == tried(1, 2.0, 0.0)
 
 
 def test_the_first_batch_is_the_best_and_the_one_to_build_upon():
@@ -84,6 +84,15 @@ def test_a_batch_that_is_worse_by_more_is_taken_back():
     assert state.rejections
     assert state.kept == pytest.approx(-1.5)
     assert state.step.multiplier == pytest.approx(0.4)
+
+
+def test_further_episodes_belong_to_what_is_built_upon():
+    state = after(10.0, 20.0).gathered(Batch(2, 1))  # the second was taken back
+    assert state.built_upon.batches == state.best.batches == (Batch(1, 0), Batch(2, 1))
+    assert state.built_upon.iteration == 1
+    state = after(10.0, 11.4).gathered(Batch(2, 1))  # built upon, but not the best
+    assert state.built_upon.batches == (Batch(2, 0), Batch(2, 1))
+    assert state.best.batches == (Batch(1, 0),)
 
 
 @pytest.mark.parametrize(("tolerance", "taken_back"), [(0.5, True), (2.0, False), ("never", False)])
@@ -224,6 +233,7 @@ def test_an_update_is_handed_over_untried_for_a_twentieth_of_what_was_gained():
 @pytest.mark.parametrize("costs", [(), (10.0,), (10.0, 11.0), (10.0, 20.0)])
 def test_a_saved_trust_region_goes_on_as_it_would_have(costs):
     state = after(*costs)
+    state = state.gathered(Batch(len(costs), 1)) if costs else state
     buffer = io.BytesIO()
     torch.save(state.state_dict(), buffer)
     buffer.seek(0)
@@ -234,10 +244,7 @@ def test_a_saved_trust_region_goes_on_as_it_would_have(costs):
             assert str(getattr(left, name)) == str(getattr(right, name)), name
         for name in ("best", "current"):
             one, other = getattr(left, name), getattr(right, name)
-            assert (one.iteration, one.cost, one.error) == (
-                other.iteration,
-                other.cost,
-                other.error,
-            )
+            for field in ("batches", "iteration", "cost", "error"):
+                assert getattr(one, field) == getattr(other, field)
             assert isinstance(other.gains, LinearGaussianPolicy)
             assert all(torch.equal(*pair) for pair in zip(one.gains, other.gains, strict=True))

@@ -38,6 +38,7 @@ ROUNDS = quadratic_cost.LBFGS_ROUNDS
 def as_in_a_worker(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """With cost fits that fit into a test, where a test does not need good ones."""
     monkeypatch.setattr(quadratic_cost, "LBFGS_ROUNDS", 10)
+    monkeypatch.setattr(quadratic_cost, "COMPARED_ROUNDS", 10)
     torch.use_deterministic_algorithms(True)
     yield
     torch.use_deterministic_algorithms(False)
@@ -100,7 +101,7 @@ class Watched:
         """Other episodes of the policy that collected the last batch, as control sees them."""
         policy = self.learner._tried[self.environment.iteration]
         world = World(self.world.task, self.task, Streams(1))
-        return self.learner.embedded(World.roll_out(world, policy, episodes, 0), [])[0]
+        return self.learner.embedded([World.roll_out(world, policy, episodes, 0)], [])[0]
 
 
 def test_as_it_is_gives_the_number_that_a_worker_stores(store: Store) -> None:
@@ -155,7 +156,7 @@ def test_dynamics_are_plain_regression_on_the_observers_rollouts(
         np.testing.assert_allclose(dynamics.F[t].numpy(), slopes[:, :-1], rtol=1e-6, atol=1e-8)
         np.testing.assert_allclose(dynamics.f[t].numpy(), slopes[:, -1], rtol=1e-6, atol=1e-8)
     batch, older = run.learner.embedded(
-        run.environment.collected(2), [run.environment.collected(1)]
+        [run.environment.collected(2)], [[run.environment.collected(1)]]
     )
     own = local.LocalLearner.fitted_cost(run.learner, batch, older).model
     assert torch.equal(cost.C, own.C)  # of the counted batch
@@ -166,20 +167,15 @@ def test_the_cost_is_fitted_on_the_observers_rollouts(
 ) -> None:
     run = Watched(tmp_path, monkeypatch, small(), Part.COST).iterate(2)
     _, dynamics, cost, *_ = run.updates[-1]
-    rollouts = Trajectories(
-        *(
-            torch.cat(p)
-            for p in zip(*(run.learner.embedded(one, [])[0] for one in run.observed), strict=True)
-        )
-    )
+    rollouts, _ = run.learner.embedded(run.observed, [])
     settings = CostFit(width=privileged.OWN_STEP, terminal=3.0)
     again = quadratic_cost.fit_quadratic_cost(rollouts, [], 0.001, settings, 4).model
     assert torch.equal(cost.C, again.C)
     older = [run.environment.collected(1)]
     batches = [run.environment.collected(2), older[0]]
-    states = [run.learner.embedded(batch, [])[0] for batch in batches]
+    states = [run.learner.embedded([batch], [])[0] for batch in batches]
     own = local.LocalLearner.infer_dynamics(
-        run.learner, states[0], states[1:], run.learner.latent_prior(older), run.streams
+        run.learner, states[0], states[1:], run.learner.latent_prior([older]), run.streams
     )
     assert torch.equal(dynamics.F, own.model.F)  # of the counted batches
 

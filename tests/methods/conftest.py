@@ -21,3 +21,4 @@ def as_in_a_worker(worker_torch: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """For every test here, with short steps."""
     monkeypatch.setattr(training, "PULSE_STEPS", 4)
     monkeypatch.setattr(quadratic_cost, "LBFGS_ROUNDS", 10)
+    monkeypatch.setattr(quadratic_cost, "COMPARED_ROUNDS", 10)

@@ -5,7 +5,7 @@ import pytest
 import torch
 from method_runs import Run
 
-from solar_cli.episodes import Experience, window_indices
+from solar_cli.episodes import Batch, Experience, window_indices
 from solar_cli.methods import solar
 from solar_cli.models.representation import Representation
 
@@ -35,11 +35,13 @@ def change(run, episodes) -> float:
 
 def before_the_update(tmp_path, linearise: str):
     """A run that has collected its third batch, and that batch."""
-    run = Run(tmp_path, "solar", EPISODES, f"update.linearise={linearise}").iterate(1, 2)
+    sets = (EPISODES, 'update.reject="never"', f"update.linearise={linearise}")
+    run = Run(tmp_path, "solar", *sets).iterate(1, 2)
     run.environment.begin(3)
     experience = Experience(run.environment)
-    region = run.learner.trust_region.judged(run.learner.collect(experience), "never")
-    return run, region, run.learner.batches(experience, region)[0]
+    region = run.learner.collect(experience)
+    [batch] = run.learner.batches(experience, region)[0]
+    return run, region, batch
 
 
 @pytest.mark.parametrize(("linearise", "preserved"), [("true", True), ("false", False)])
@@ -54,7 +56,7 @@ def test_a_changed_head_is_undone_by_line_six_alone(tmp_path, linearise, preserv
         head.bias.copy_(mixing @ head.bias + 0.1)
     run.learner.representation.moved_in = 3
     assert change(run, episodes) > 0.3
-    states, _ = run.learner.embedded(episodes, [])
+    states, _ = run.learner.embedded([episodes], [])
     run.learner.handed = run.learner.linearised(region, states).policy
     # The new latents are an affine map of the old ones, which a linear policy can undo.
     assert (change(run, episodes) < 0.01) == preserved
@@ -93,7 +95,7 @@ def test_a_frozen_encoder_leaves_the_policy_as_it_is(tmp_path):
     run, region, episodes = before_the_update(tmp_path, "true")
     run.learner.representation.update(Experience(run.environment))
     assert run.learner.representation.moved_in == 1
-    previous = run.learner.linearised(region, run.learner.embedded(episodes, [])[0])
+    previous = run.learner.linearised(region, run.learner.embedded([episodes], [])[0])
     for left, right in zip(previous.policy, run.learner.gains, strict=True):
         assert torch.equal(left, right)
 
@@ -120,3 +122,28 @@ def test_going_back_to_a_policy_of_older_latents_preserves_it(tmp_path, monkeypa
     assert run.learner.trust_region.current.iteration == 2
     run.learner.gains = improved[0]
     assert change(run, run.environment.collected(2)) < 0.2
+
+
+def test_the_best_policy_collects_again_on_the_latents_of_now(tmp_path):
+    """It acted before the fine-tuning of its iteration; the next policy is worse."""
+    costs = {2: -1e3, 3: 1e3}
+    run = Run(
+        tmp_path,
+        "solar",
+        "batches={ initial = 32, noisy = 32, noise_free = 2 }",
+        "training.steps=60",
+        "training.fine_tune_steps=12",
+        "training.fine_tune_rate=0.001",
+        costs=lambda iteration, cost: cost + costs.get(iteration, 0.0),
+    )
+    run.iterate(1, 2)
+    assert run.learner.representation.moved_in == 2
+    best, again = Batch(2, 1), Batch(3, 1)
+    run.environment.begin(3)
+    region = run.learner.collect(Experience(run.environment))
+    assert region.rejections
+    run.learner.handed = run.learner._best_of_now(
+        Experience(run.environment), run.learner.trust_region
+    )
+    assert change(run, run.environment.batch(best)) < 0.2
+    assert change(run, run.environment.batch(again)) < 1e-3

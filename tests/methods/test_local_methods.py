@@ -9,7 +9,7 @@ from method_runs import Run
 
 from solar_cli.control import trust_region
 from solar_cli.envs import build_task
-from solar_cli.episodes import Evaluation, Experience, evaluate
+from solar_cli.episodes import Batch, Episodes, Evaluation, Experience, evaluate
 from solar_cli.methods import Diverged, local, solar
 from solar_cli.streams import Streams
 
@@ -46,7 +46,7 @@ def test_an_update_that_promises_little_is_tried_before_it_is_handed_over(
         assert torch.equal(handed, part)
     run.environment.begin(3)
     run.learner.collect(Experience(run.environment))
-    z, _ = run.learner.embedded(run.environment.collected(3), [])
+    z, _ = run.learner.embedded([run.environment.collected(3)], [])
     means = torch.einsum("tij,ntj->nti", newest.K, z.z[:, :-1]) + newest.k
     torch.testing.assert_close(z.action_means, means)  # the newest is what is tried
 
@@ -77,9 +77,9 @@ def test_a_noise_free_batch_judges_the_policy(tmp_path):
     for iteration, noisy in ((1, 8), (2, 4)):
         episodes = run.environment.collected(iteration)
         assert len(episodes) == noisy + 3
-        quiet = episodes[noisy:]
+        quiet, loud = episodes[:3], episodes[3:]
         np.testing.assert_array_equal(quiet.actions, quiet.action_means)
-        assert not np.isclose(episodes[:noisy].actions, episodes[:noisy].action_means).any()
+        assert not np.isclose(loud.actions, loud.action_means).any()
         region = run.learner.trust_region
         for anchor in {region.best.iteration: region.best, 2: region.current}.values():
             if anchor.iteration == iteration:
@@ -107,6 +107,28 @@ def test_a_rejected_batch_goes_back_to_the_best_policy_and_its_data(tmp_path, mo
     assert run.metrics[2]["rejected"] == 0.0
     assert run.learner.trust_region.current.iteration == 3
     np.testing.assert_array_equal(dynamics[2][0].costs, run.environment.collected(3).costs)
+
+
+def test_where_episodes_without_noise_reject_a_policy_the_best_collects_again(
+    tmp_path, monkeypatch
+):
+    dynamics = spied(monkeypatch, "infer_dynamics")
+    sets = ("batches={ initial = 8, noisy = 5, noise_free = 3 }", "local_fit.older_batches=2")
+    worse = {2: 1e3, 3: 1e3}
+    costs = lambda iteration, costs: costs + worse.get(iteration, 0.0)  # noqa: E731
+    run = Run(tmp_path, "solar", *sets, costs=costs).iterate(1, 3)
+    batch = lambda *names: Episodes.joined([run.environment.batch(Batch(*n)) for n in names])  # noqa: E731
+    assert not batch((2, 1), (3, 1)).action_means.any()  # the first policy, not the newest
+    assert batch((2, 0), (3, 0)).action_means.any()
+    of_the_best, older = dynamics[2][:2]
+    expected = batch((1, 0), (1, 1), (2, 1), (3, 1))
+    np.testing.assert_array_equal(of_the_best.actions, expected.actions)
+    assert len(older) == 2
+    for found, name in zip(older, [(3, 0), (2, 0)], strict=True):
+        np.testing.assert_array_equal(found.actions, batch(name).actions)
+    assert run.learner.trust_region.best.cost == batch((1, 0)).costs.sum(axis=1).mean()
+    run.iterate(4, 4)
+    assert run.learner.trust_region.current.batches == (Batch(4, 0), Batch(4, 1))
 
 
 def test_without_rejection_the_newest_batch_is_built_upon(tmp_path):

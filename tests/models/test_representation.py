@@ -1,6 +1,7 @@
 """A representation is watched, repaired, fixed or fine-tuned, and resumed with the same bits."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import torch
 from bits import digest, through_a_file
 from model_problems import vector_episodes, vector_task
 
-from solar_cli.episodes import Episodes, window_indices
+from solar_cli.episodes import Batch, Episodes, window_indices
 from solar_cli.errors import UsageError
 from solar_cli.models import representation, training
 from solar_cli.models.priors import BayesianLDS
@@ -42,9 +43,9 @@ class Scores:
     def __init__(self, *scores: float) -> None:
         self.scores = scores
         self.states: list[torch.Tensor] = []
-        self.episodes: list[Episodes] = []
+        self.episodes: list[list[Episodes]] = []
 
-    def __call__(self, model: Representation, episodes: Episodes) -> float:
+    def __call__(self, model: Representation, episodes: list[Episodes]) -> float:
         self.states.append(model.embed(FIRST))
         self.episodes.append(episodes)
         return self.scores[min(len(self.states), len(self.scores)) - 1]
@@ -169,7 +170,7 @@ def test_attempts_are_judged_on_episodes_that_they_did_not_learn_from(monkeypatc
     make(score, held_out=0.3, attempts=2).update(Collected(FIRST))
     kept = round(0.3 * 14)
     assert len(judged) == len(score.episodes) == len(standardised) == 2
-    for held_out, every in zip(judged, score.episodes, strict=True):
+    for [held_out], [every] in zip(judged, score.episodes, strict=True):
         np.testing.assert_array_equal(held_out.frames, FIRST.frames[-kept:])
         np.testing.assert_array_equal(every.frames, FIRST.frames)
     for frames in standardised:
@@ -189,7 +190,7 @@ def test_an_active_latent_is_one_whose_mean_carries_its_variance(monkeypatch):
         "posterior",
         lambda *_: segments._replace(variance=variance.expand_as(segments.variance)),
     )
-    assert model._judge(FIRST)["active_latents"] == 1.0
+    assert model._judge([FIRST])["active_latents"] == 1.0
 
 
 def test_segments_must_be_longer_than_windows():
@@ -301,6 +302,30 @@ def conditioned(model: Representation, *batches: Episodes) -> list[torch.Tensor]
 
 def own_factor(model: Representation) -> list[torch.Tensor]:
     return list(model.dynamics_prior([], as_it_stands=True).factor)
+
+
+@pytest.mark.parametrize("fine_tune_steps", [0, 3])
+def test_the_same_networks_encode_no_collected_frame_twice(monkeypatch, fine_tune_steps):
+    """What is remembered is what encoding anew gives, also of networks that have changed since."""
+    named = [
+        replace(vector_episodes(TASK, 5, seed=seed), batch=Batch(seed, 0)) for seed in (1, 2, 3)
+    ]
+    model = make(fine_tune_steps=fine_tune_steps)
+    for last in (1, 2, 3):
+        model.update(Collected(*named[:last]))
+        for known in named[:last]:
+            unknown = replace(known, batch=None)
+            assert torch.equal(model.embed(known), model.embed(unknown))
+    encoded: list[int] = []
+    posterior = model._model.posterior
+    monkeypatch.setattr(
+        model._model, "posterior", lambda e, device: encoded.append(len(e)) or posterior(e, device)
+    )
+    for known in named:
+        model.embed(known)
+    assert encoded == []
+    model.embed(named[0][:3])
+    assert encoded == [3]
 
 
 def test_a_frozen_encoder_keeps_its_states_and_learns_its_dynamics():
