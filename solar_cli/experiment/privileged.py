@@ -119,7 +119,7 @@ class TrueState(Representation):
             self._model.networks.standardise_by(
                 torch.from_numpy(first).flatten(0, 1).to(self.device)
             )
-            self._basis = self._whitening(recent)
+            self._basis = self._whitening(self._posterior(recent))
             self._trained, self.moved_in = True, experience.iteration
         self._conclude(recent)
         return self._model.prior.metrics()

@@ -42,6 +42,10 @@ class Segments(NamedTuple):
             return part.flatten(0, 1)
         return part[self.live[:, self.live.shape[1] - part.shape[1] :]]
 
+    def of(self, rows: slice) -> Segments:
+        """Some of them."""
+        return Segments(*(None if part is None else part[rows] for part in self))  # type: ignore[arg-type]
+
     @staticmethod
     def joined(parts: Sequence[Segments]) -> Segments:
         """Those of several batches of whole episodes."""

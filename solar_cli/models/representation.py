@@ -143,7 +143,9 @@ class Representation:
             name = f"attempt {attempt}"
             self._latents.clear()
             terms = self._trainer.fit(name, self._model, [learned], training.steps)
-            self._basis = self._whitening([learned])
+            segments = self._posterior(batches).of(slice(-kept))
+            self._model.prior.conclude(segments)
+            self._basis = self._whitening(segments)
             metrics = self._judge([held_out])
             metrics["held_out_cost_r2"] = self._cost_score(self, batches)
             alive = self._alive(metrics) and metrics["held_out_cost_r2"] >= LEAST_COST_R2
@@ -181,6 +183,7 @@ class Representation:
         self._latents.clear()
         terms = self._trainer.fit(name, self._model, recent, steps, fine_tuning=True)
         self._before = None
+        self._conclude(recent)
         kills = self._alive(before.metrics) and not self._alive(self._judge(newest))
         if kills:
             self._take_up(before.parameters)
@@ -288,8 +291,7 @@ class Representation:
         index = window_indices(latents.shape[1] - 1, self.task.observation.window)
         return latents[:, torch.from_numpy(index[:, ::-1].copy()).to(latents.device)]
 
-    def _whitening(self, batches: list[Episodes]) -> LatentBasis:
-        segments = self._posterior(batches)
+    def _whitening(self, segments: Segments) -> LatentBasis:
         return LatentBasis.whitening(segments.counted(self._windows(segments.mean)))
 
     def _parameters(self) -> dict[str, Any]:

@@ -18,7 +18,6 @@ from torch import Tensor
 from solar_cli.episodes import Episodes
 from solar_cli.errors import SolarError
 from solar_cli.models.latent_model import LatentModel, Minibatch
-from solar_cli.models.priors import Segments
 from solar_cli.pulse import Diverged, Pulse
 from solar_cli.settings.local import Training
 from solar_cli.streams import Streams
@@ -47,7 +46,7 @@ class Trainer:
         *,
         fine_tuning: bool = False,
     ) -> dict[str, float]:
-        """Train for ``steps`` steps, then conclude with all data; smoothed ELBO terms.
+        """Train for ``steps`` steps; smoothed ELBO terms. The prior is to be concluded then.
 
         ``name`` keys the run's random draws; a run of that name that was interrupted goes on.
         When fine-tuning, half of the segments come from the newest batch.
@@ -86,7 +85,6 @@ class Trainer:
                 self.pulse(f"training the model ({name})", running["step"] / steps)
                 last = time.perf_counter()  # a pulse may take its time to save
         self._running = self._optimiser = None
-        model.prior.conclude(data.posterior(model))
         seconds = running["seconds"] + time.perf_counter() - last
         smoothed = {term: float(value) for term, value in running["terms"].items()}
         return {**smoothed, "seconds_training": seconds}
@@ -216,7 +214,3 @@ class Dataset:
     def _firsts(self, length: int) -> NDArray[np.int64]:
         """(N,) segments of ``length`` frames that each episode has."""
         return np.asarray(np.maximum(self.episodes.lengths + 2 - length, 0))
-
-    def posterior(self, model: LatentModel) -> Segments:
-        """q(z | s) of every episode."""
-        return model.posterior(self.episodes, self.device)

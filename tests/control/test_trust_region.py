@@ -217,12 +217,12 @@ def test_a_promise_is_the_fall_of_what_is_collected():
     assert found == pytest.approx(collected(*before) - collected(*now), rel=1e-9)
 
 
-def test_an_update_is_handed_over_untried_for_a_twentieth_of_what_was_gained():
+def test_an_update_is_handed_over_untried_for_a_fifth_of_what_was_gained():
     state = after(100.0, 80.0, 60.0, 60.5)
     assert state.first == 100.0
     assert state.best.cost == 60.0
-    assert state.trusts(2.1)
-    assert not state.trusts(1.9)
+    assert state.trusts(8.1)
+    assert not state.trusts(7.9)
     assert not state.trusts(math.nan)
     rejected = after(100.0, 80.0, 60.0, 70.0)  # the model has just been wrong
     assert not rejected.trusts(40.0)

@@ -304,6 +304,12 @@ def own_factor(model: Representation) -> list[torch.Tensor]:
     return list(model.dynamics_prior([], as_it_stands=True).factor)
 
 
+def test_a_first_training_ends_with_the_exact_factor_of_what_it_learned_from():
+    model = make(held_out=0.3)
+    model.update(Collected(FIRST))
+    assert digest(own_factor(model)) == digest(conditioned(model, FIRST[: -round(0.3 * 14)]))
+
+
 @pytest.mark.parametrize("fine_tune_steps", [0, 3])
 def test_the_same_networks_encode_no_collected_frame_twice(monkeypatch, fine_tune_steps):
     """What is remembered is what encoding anew gives, also of networks that have changed since."""

@@ -244,7 +244,7 @@ def test_the_scale_makes_a_minibatch_as_large_as_the_data(window):
         found = model.loss(batch, 1.0)[1]
         transitions += data.scale(batch) * float(found.transitions.n) / firsts
         starts += data.scale(batch) * float(found.starts.n) / firsts
-    whole = model.prior.statistics(data.posterior(model))
+    whole = model.prior.statistics(model.posterior(data.episodes, "cpu"))
     assert starts == pytest.approx(float(whole.starts.n)) == 6
     assert transitions == pytest.approx(float(whole.transitions.n)) == 6 * (9 - window)
 
@@ -296,16 +296,13 @@ def test_the_learning_rate_falls_as_a_cosine_or_stays(monkeypatch):
     assert rates == [0.003] * 3
 
 
-def test_training_lowers_the_loss_and_ends_with_the_exact_factor():
+def test_training_lowers_the_loss():
     model = untrained()
     data = Dataset([EPISODES], "cpu")
     batch = draw(data, 10_000)
     before = float(model.loss(batch, 1.0)[0].detach())
     found = trainer(steps=60).fit(NAME, model, [EPISODES], 60)
     assert float(model.loss(batch, 1.0)[0].detach()) < before - 10.0
-    closed = untrained().prior
-    closed.conclude(data.posterior(model))
-    assert digest(closed.state_dict()) == digest(model.prior.state_dict())
     assert set(terms(found)) == {"elbo_reconstruction", "elbo_kl"}
     assert all(math.isfinite(value) for value in found.values())
 
