@@ -28,6 +28,7 @@ from solar_cli.settings.local import LocalFit
 from solar_cli.streams import Streams
 
 ACTION_RIDGE = 1e-4  # noise of an action, in units of its std, that slopes must bear
+MOST_POINTS = 5000  # that a mixture is fitted to; gps takes 20 episodes
 LEAST_VARIANCE = 1e-9  # of a whitened latent: keeps Sigma invertible
 
 
@@ -251,8 +252,10 @@ def _mixture_prior(
     The mixture sees older batches too, as in the authors' release of guided policy search.
     """
     seen = [torch.cat([batch.x, batch.y], dim=-1)[batch.live > 0] for batch in (samples, *past)]
-    flat, sampled = torch.cat(seen), samples.sampled
-    fit = gmm.fit_mixture(flat, gmm.cluster_count(len(flat)), streams.generator("mixture"))
+    flat, sampled, stream = torch.cat(seen), samples.sampled, streams.generator("mixture")
+    if len(flat) > MOST_POINTS:
+        flat = flat[stream.choice(len(flat), MOST_POINTS, replace=False)]
+    fit = gmm.fit_mixture(flat, gmm.cluster_count(len(flat)), stream)
     points, live = torch.cat([samples.x, samples.y], dim=-1)[:sampled], samples.live[:sampled]
     joint = gmm.fit_joint(points, gmm.local_prior(fit.mixture, points, live), live)
     F, f, Sigma = gmm.condition_joint(joint, samples.x.shape[-1])
