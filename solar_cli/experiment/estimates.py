@@ -20,7 +20,7 @@ from solar_cli.store.records import CellRecord, State
 if TYPE_CHECKING:
     from solar_cli.store.store import Store
 
-WORKER_BYTES = 2**30
+WORKER_BYTES = 2 * 2**30
 """memory that a worker is counted with: what a cell may take at its peak"""
 FLOAT_BYTES = 8
 Kind = tuple[str, str, str]

@@ -83,7 +83,7 @@ def run(
 
 
 def default_workers(pending: int) -> int:
-    """As many workers as there are cores and gigabytes of memory, at most one a pending cell."""
+    """As many workers as there are cores and memory for, at most one a pending cell."""
     available = memory_bytes("MemAvailable")
     fitting = cores() if available is None else available // WORKER_BYTES
     return max(1, min(cores(), fitting, pending))

@@ -296,7 +296,7 @@ def test_a_worker_that_cannot_be_started_is_an_outcome(store: Store, make_cells:
     [
         (8 * 2**30, 4, 10, 4),
         (8 * 2**30, 4, 3, 3),
-        (2 * 2**30 + 5, 4, 10, 2),
+        (4 * 2**30 + 5, 4, 10, 2),
         (2**20, 4, 10, 1),
         (None, 4, 10, 4),
     ],
