@@ -53,6 +53,8 @@ class Batch(NamedTuple):
     iteration: int
     call: int
     """the first of an iteration is 0"""
+    noisy: bool = True
+    """whether the policy had its noise"""
 
 
 @dataclass(frozen=True)
@@ -280,6 +282,11 @@ class Environment:
         key = (self.iteration, self._call)
         self._call += 1
         entry = next((e for e in self._ledger if (e["iteration"], e["call"]) == key), None)
+        if entry is not None and (entry["noisy"], entry["episodes"]) != (noisy, episodes):
+            raise LostFiles(  # of a version that collected in another order, say
+                f"iteration {key[0]} has {entry['episodes']} episodes where {episodes} others are "
+                "collected now: start the cell anew with --redo"
+            )
         found = None if entry is None else self._load(entry)
         if found is None:
             streams = self._streams.under(*key)
@@ -290,7 +297,7 @@ class Environment:
                 [streams.generator("reset", i) for i in range(episodes)],
                 streams.generator("noise") if noisy else None,
             )
-            found = replace(collected.episodes, batch=Batch(*key))
+            found = replace(collected.episodes, batch=Batch(*key, noisy))
             data = _packed(found)
             made = self._described(key, noisy, collected, data)
             # Compared as files: one that another zlib has compressed counts as another, too.
@@ -308,7 +315,7 @@ class Environment:
 
     def batches(self) -> list[Batch]:
         """All that was collected, oldest first."""
-        return [Batch(int(entry["iteration"]), int(entry["call"])) for entry in self._ledger]
+        return [_name(entry) for entry in self._ledger]
 
     def batch(self, name: Batch) -> Episodes:
         """The episodes of one call."""
@@ -371,9 +378,8 @@ class Environment:
         if hashlib.sha256(data).hexdigest() != entry["sha256"]:
             return None
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-            batch = Batch(int(entry["iteration"]), int(entry["call"]))
             window = self.settings.observation.window
-            return Episodes(**dict(arrays), window=window, batch=batch)
+            return Episodes(**dict(arrays), window=window, batch=_name(entry))
 
     def _described(
         self, key: tuple[int, int], noisy: bool, collected: Evaluation, data: bytes
@@ -404,6 +410,10 @@ class Environment:
             file.flush()
             os.fsync(file.fileno())
         beside.replace(self._folder / name)
+
+
+def _name(entry: Mapping[str, Any]) -> Batch:
+    return Batch(int(entry["iteration"]), int(entry["call"]), bool(entry["noisy"]))
 
 
 def _packed(episodes: Episodes) -> bytes:

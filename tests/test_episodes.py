@@ -366,12 +366,23 @@ def test_a_learner_meets_its_experience_and_no_judge(environment: Environment):
     assert public == {"collect", "batches", "batch", "recent", "iteration"}
 
 
+@pytest.mark.parametrize(("count", "noisy"), [(3, False), (2, True)])
+def test_another_call_does_not_get_what_was_collected(environment: Environment, count, noisy):
+    """A version of another order of calls left a ledger."""
+    environment.begin(1)
+    environment.collect(Pull(), 3)
+    environment.begin(1)
+    with pytest.raises(SolarError, match=r"iteration 1 .*3 episodes.*--redo"):
+        environment.collect(Pull(), count, noisy=noisy)
+
+
 def test_batches_are_found_by_their_names(environment: Environment):
     calls: dict[Batch, Episodes] = {}
     for iteration in (1, 2):
         environment.begin(iteration)
-        for call in (0, 1):
-            calls[Batch(iteration, call)] = environment.collect(Pull(), 1 + call)
+        for call, noisy in enumerate((False, True)):
+            name = Batch(iteration, call, noisy)
+            calls[name] = environment.collect(Pull(), 1 + call, noisy=noisy)
     assert environment.batches() == list(calls)
     for name, collected in calls.items():
         found = environment.batch(name)

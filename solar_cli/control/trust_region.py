@@ -10,6 +10,8 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
+import torch
+
 from solar_cli.control.linear_gaussian import (
     LinearDynamics,
     LinearGaussianPolicy,
@@ -45,20 +47,22 @@ class Anchor(NamedTuple):
     """its standard error"""
 
     @staticmethod
-    def of(batch: Batch, gains: LinearGaussianPolicy, episodes: Episodes) -> Anchor:
-        """Judge a policy by the cost of a batch of its episodes."""
+    def of(gains: LinearGaussianPolicy, episodes: Episodes) -> Anchor:
+        """Judge a policy by the cost of a collected batch of its episodes."""
+        assert episodes.batch is not None
         totals = episodes.costs.sum(axis=1)
         error = totals.std(ddof=1) / math.sqrt(len(totals)) if len(totals) > 1 else 0.0
-        return Anchor((batch,), gains, float(totals.mean()), float(error))
+        return Anchor((episodes.batch,), gains, float(totals.mean()), float(error))
 
     @property
     def iteration(self) -> int:
         """The first that collected its episodes."""
         return self.batches[0].iteration
 
-    def with_more(self, batch: Batch) -> Anchor:
-        """The same policy with further episodes."""
-        return self._replace(batches=(*self.batches, batch))
+    def with_more(self, episodes: Episodes) -> Anchor:
+        """The same policy with a further batch."""
+        assert episodes.batch is not None
+        return self._replace(batches=(*self.batches, episodes.batch))
 
 
 @dataclass(frozen=True)
@@ -114,9 +118,9 @@ class TrustRegion:
         assert self.current is not None
         return self.current
 
-    def gathered(self, batch: Batch) -> TrustRegion:
-        """Further episodes of the policy that is built upon."""
-        current = self.built_upon.with_more(batch)
+    def gathered(self, episodes: Episodes) -> TrustRegion:
+        """With a further batch of the policy that is built upon."""
+        current = self.built_upon.with_more(episodes)
         same = self.best is not None and self.best.batches == self.built_upon.batches
         best = current if same else self.best
         return replace(self, current=current, best=best)
@@ -162,7 +166,7 @@ class TrustRegion:
             current=_anchor(state["current"]),
             promised=state["promised"],
             first=state["first"],
-            rejections=state.get("rejections", 0),  # of a cell that an older version saved
+            rejections=state["rejections"],
         )
 
 
@@ -171,16 +175,21 @@ def promised_fall(
     policy: LinearGaussianPolicy,
     dynamics: LinearDynamics,
     cost: QuadraticCost,
+    *,
+    noisy: bool,
 ) -> float:
-    """By how much the model says that the cost of t = 0..T-1 falls.
+    """By how much the model says that the cost of t = 0..T-1 falls, with or without action noise.
 
     Without the weight of the last state, whose cost is never observed: what is collected is judged
     by the same sum.
     """
-    before, after = (
-        expected_cost(gains, dynamics, cost)[..., :-1].sum() for gains in (previous, policy)
-    )
-    return float(before - after)
+
+    def costs(gains: LinearGaussianPolicy) -> float:
+        if not noisy:
+            gains = gains._replace(S=torch.zeros_like(gains.S))
+        return float(expected_cost(gains, dynamics, cost)[..., :-1].sum())
+
+    return costs(previous) - costs(policy)
 
 
 def _plain(anchor: Anchor | None) -> dict[str, Any] | None:

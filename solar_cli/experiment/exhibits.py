@@ -30,19 +30,19 @@ def exhibit(
     cell: str,
     attempt: int,
     iteration: int,
-    kind: str,
+    shown: NDArray[np.uint8] | None,
     judged: Evaluation,
     of: Learner,
 ) -> None:
-    """Store the artifacts ``animation`` and, of a learner that has them, the two others.
+    """Store the artifacts ``animation``, of a task that can be ``shown``, and of a learner that has
+    them the two others.
 
-    ``animation.npz`` has ``frames`` (K, T+1, *frame) and ``kind``, what they are (``image`` or
-    ``state``); ``reconstruction.npz`` has ``original`` and ``reconstruction`` (M, *frame);
-    ``latents.npz`` has ``latents`` (n, d), and where the simulator was at each, ``truth`` (n, k)
-    with its ``names`` (k,).
+    ``animation.npz`` has ``frames`` (K, T+1, C, H, W) uint8; ``reconstruction.npz`` has
+    ``original`` and ``reconstruction`` (M, *frame); ``latents.npz`` has ``latents`` (n, d), and
+    where the simulator was at each, ``truth`` (n, k) with its ``names`` (k,).
     """
     episodes = judged.episodes[:SHOWN]
-    exhibits: dict[str, Arrays] = {"animation": {"frames": episodes.frames, "kind": np.array(kind)}}
+    exhibits: dict[str, Arrays] = {} if shown is None else {"animation": {"frames": shown}}
     seen = of.reconstruct(episodes)
     if seen is not None:
         count, times = episodes.frames.shape[:2]

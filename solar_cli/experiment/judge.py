@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
-from solar_cli.envs import build_task
-from solar_cli.episodes import Evaluation, Policy, evaluate
+import numpy as np
+from numpy.typing import NDArray
+
+from solar_cli.envs import build_task, drawable
+from solar_cli.episodes import Evaluation, Policy, evaluate, roll_out
+from solar_cli.errors import SolarError
 from solar_cli.experiment.watched import WatchedTask
 from solar_cli.settings import Cell
 from solar_cli.store.records import Metric
 from solar_cli.streams import Streams
+
+DRAWN_ROWS = 160
+"""of a picture of a task that is learned from its state"""
 
 
 class Judge:
@@ -34,6 +42,41 @@ class Judge:
             episodes,
             self._streams.under(iteration),
         )
+
+    def pictures(
+        self, evaluation: Evaluation, iteration: int, episodes: int
+    ) -> NDArray[np.uint8] | None:
+        """Images (K, T+1, C, H, W) of its first ``episodes``; None where nothing can be seen.
+
+        Where a state is seen, they are played again.
+        """
+        settings, first = self._configuration.task, evaluation.episodes[:episodes]
+        if settings.observation.kind == "image":
+            return first.frames
+        try:
+            shown = drawable(settings, DRAWN_ROWS)
+            task = build_task(shown)
+        except SolarError:
+            return None
+        streams = self._streams.under(iteration)
+        resets = [streams.generator("reset", i) for i in range(len(first))]
+        return roll_out(task, shown, Recorded(first.actions), resets, None).episodes.frames
+
+
+class Recorded:
+    """A policy that does what was done: ``actions`` (N, T, a)."""
+
+    def __init__(self, actions: NDArray[np.float64]) -> None:
+        self.actions = actions
+
+    def start(self, episodes: int, stream: np.random.Generator | None) -> None:
+        """Nothing is carried through an episode."""
+
+    def act(
+        self, observations: NDArray[Any], t: int, state: Any
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], Any]:
+        """As `Policy.act`."""
+        return self.actions[:, t], self.actions[:, t], state
 
 
 def measured(evaluation: Evaluation) -> list[Metric]:

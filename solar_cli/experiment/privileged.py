@@ -156,7 +156,7 @@ class Privileged(LocalLearner):
             self.pulse,
         )
 
-    def collect(self, experience: Experience) -> TrustRegion:
+    def collect_and_judge(self, experience: Experience) -> TrustRegion:
         """As the method; the policy is kept, with the representation that it acts on."""
         frozen = self.make_representation()
         frozen.load_state_dict(self.representation.state_dict())
@@ -164,7 +164,7 @@ class Privileged(LocalLearner):
             self.gains, frozen, self.task.observation.window, self.task.exploration.smoothing
         )
         self._rollouts = None
-        return super().collect(experience)
+        return super().collect_and_judge(experience)
 
     def linearised(self, region: TrustRegion, states: Trajectories) -> Linearisation:
         """As the method; line 6 is where the latents of now and the batch built upon are known.

@@ -23,7 +23,7 @@ from solar_cli.envs import build_task
 from solar_cli.episodes import Environment, Episodes, Evaluation, Experience, Policy
 from solar_cli.errors import SolarError
 from solar_cli.experiment.checkpointing import Checkpoints
-from solar_cli.experiment.exhibits import exhibit
+from solar_cli.experiment.exhibits import SHOWN, exhibit
 from solar_cli.experiment.judge import Judge, measured
 from solar_cli.experiment.messages import Message
 from solar_cli.experiment.stopwatch import Stopwatch
@@ -194,7 +194,7 @@ class Session:
             self._cell.hash,
             self._attempt,
             self._iteration,
-            self._cell.configuration.task.observation.kind,
+            self._judge.pictures(self._evaluation, self._iteration, SHOWN),
             self._evaluation,
             self.learner,
         )

@@ -15,7 +15,12 @@ import torch
 from numpy.typing import NDArray
 
 from solar_cli.control.latent_policy import LatentPolicy
-from solar_cli.control.linear_gaussian import LinearGaussianPolicy, initial_policy
+from solar_cli.control.linear_gaussian import (
+    LinearDynamics,
+    LinearGaussianPolicy,
+    QuadraticCost,
+    initial_policy,
+)
 from solar_cli.control.linearise import Linearisation, linearise_policy
 from solar_cli.control.local_dynamics import LocalDynamics, infer_dynamics
 from solar_cli.control.lqr import Outcome, PolicyUpdate
@@ -23,8 +28,8 @@ from solar_cli.control.quadratic_cost import FittedCost, fit_quadratic_cost
 from solar_cli.control.step_size import StepSize
 from solar_cli.control.task_checks import task_metrics
 from solar_cli.control.trajectories import Trajectories
-from solar_cli.control.trust_region import Anchor, TrustRegion
-from solar_cli.episodes import Batch, Episodes, Evaluation, Experience
+from solar_cli.control.trust_region import Anchor, TrustRegion, promised_fall
+from solar_cli.episodes import Episodes, Evaluation, Experience
 from solar_cli.models.diagnostics import latent_metrics
 from solar_cli.models.priors import LatentPrior, Prior
 from solar_cli.models.representation import Representation
@@ -34,7 +39,7 @@ from solar_cli.settings.local import LocalMethod
 from solar_cli.streams import Streams
 
 MOST_BATCHES = 4
-"""of the policy that is built upon, newest first"""
+"""of the policy that is built upon, the last ones: more than these only cost time"""
 
 
 class LocalLearner(ABC):
@@ -110,7 +115,7 @@ class LocalLearner(ABC):
             return None
         return step * steps * region.step.multiplier
 
-    def collect(self, experience: Experience) -> TrustRegion:
+    def collect_and_judge(self, experience: Experience) -> TrustRegion:
         """Line 4: what to build upon, and episodes of it.
 
         Where the card has episodes without noise, they come first and judge the newest policy. If
@@ -120,35 +125,47 @@ class LocalLearner(ABC):
         noisy = batches.initial if experience.iteration == 1 else batches.noisy
         newest = self._acting(self.gains)
         if not batches.noise_free:
-            return self._judged(experience, experience.collect(newest, noisy))
-        judges = experience.collect(newest, batches.noise_free, noisy=False)
-        region = self._judged(experience, judges)
+            return self._judged(self._collected(experience, newest, noisy))
+        judges = self._collected(experience, newest, batches.noise_free, noisy=False)
+        region = self._judged(judges)
         again = self._acting(self._best_of_now(experience, region)) if region.rejections else newest
-        experience.collect(again, noisy)
-        return region.gathered(Batch(experience.iteration, 1))
+        return region.gathered(self._collected(experience, again, noisy))
 
-    def _judged(self, experience: Experience, episodes: Episodes) -> TrustRegion:
-        """What to build upon, after the first episodes of an iteration."""
+    @staticmethod
+    def _collected(
+        experience: Experience, policy: LatentPolicy, count: int, *, noisy: bool = True
+    ) -> Episodes:
+        episodes = experience.collect(policy, count, noisy=noisy)
         if not np.isfinite(episodes.costs).all():
             raise Diverged(f"a cost of iteration {experience.iteration} is not finite")
-        tried = Anchor.of(Batch(experience.iteration, 0), self.gains, episodes)
+        return episodes
+
+    def _judged(self, episodes: Episodes) -> TrustRegion:
+        """What to build upon, after the first episodes of an iteration."""
+        tried = Anchor.of(self.gains, episodes)
         return self.trust_region.judged(tried, self.settings.update.reject)
 
     def _best_of_now(self, experience: Experience, region: TrustRegion) -> LinearGaussianPolicy:
         """The policy that is built upon, on the latents of now."""
         if not self._needs_line_six(region):
             return region.built_upon.gains
-        states, _ = self.embedded(self.batches(experience, region)[0], [])
-        return self.linearised(region, states).policy.held(states.reached, self.task.horizon)
+        states, _ = self.embedded(self.to_learn_from(experience, region)[0], [])
+        gains = LocalLearner.linearised(self, region, states).policy
+        return gains.held(states.reached, self.task.horizon)
 
-    def batches(
+    def to_learn_from(
         self, experience: Experience, region: TrustRegion
     ) -> tuple[list[Episodes], list[list[Episodes]]]:
-        """The batches to update from, and those of other iterations, the newest one first."""
+        """The batches to update from, and those of other iterations, the newest one first.
+
+        An iteration of which only episodes without noise are left, a rejected one, says nothing of
+        what actions do.
+        """
         chosen = region.built_upon.batches[-MOST_BATCHES:]
         others = [batch for batch in experience.batches() if batch not in chosen]
-        iterations = [list(group) for _, group in groupby(others, lambda batch: batch.iteration)]
-        recent = iterations[::-1][: self.settings.local_fit.older_batches]
+        groups = [list(group) for _, group in groupby(others, lambda batch: batch.iteration)]
+        varied = [group for group in groups if any(batch.noisy for batch in group)]
+        recent = varied[::-1][: self.settings.local_fit.older_batches]
         return (
             [experience.batch(name) for name in chosen],
             [[experience.batch(name) for name in group] for group in recent],
@@ -217,11 +234,13 @@ class LocalLearner(ABC):
         self,
         region: TrustRegion,
         previous: LinearGaussianPolicy,
-        promised: float,
         update: PolicyUpdate,
+        model: tuple[LinearDynamics, QuadraticCost],
         reached: int,
     ) -> dict[str, float]:
         """Make the update the policy to try next; metrics of the step.
+
+        What it promises is of episodes as they will judge it; what is handed over has no noise.
 
         What few episodes ``reached`` is planned for, so that there is a future to act for; the
         gains that act for it are those before, which go on.
@@ -229,7 +248,11 @@ class LocalLearner(ABC):
         if not all(bool(torch.isfinite(part).all()) for part in update.policy):
             raise Diverged("the updated policy is not finite")
         self.gains = update.policy.held(reached, self.task.horizon)
-        trusted = self.settings.update.reject == "never" or region.trusts(promised)
+        promised, without_noise = (
+            promised_fall(previous, update.policy, *model, noisy=noisy)
+            for noisy in (not self.settings.batches.noise_free, False)
+        )
+        trusted = self.settings.update.reject == "never" or region.trusts(without_noise)
         self.handed = self.gains if trusted else previous.held(reached, self.task.horizon)
         self.trust_region = replace(region, promised=promised)
         self.updates += 1

@@ -8,7 +8,6 @@ another model into the same page.
 from __future__ import annotations
 
 from solar_cli.control.lqr import improve_policy
-from solar_cli.control.trust_region import promised_fall
 from solar_cli.episodes import Experience
 from solar_cli.methods.local import LocalLearner
 from solar_cli.models.priors import BayesianLDS, Prior
@@ -25,8 +24,8 @@ class Solar(LocalLearner):
 
     def iterate(self, experience: Experience) -> dict[str, float]:
         """One turn of Algorithm 1 (lines 4 to 8)."""
-        region = self.collect(experience)  # line 4: N rollouts of the current policy
-        batches, older = self.batches(experience, region)
+        region = self.collect_and_judge(experience)  # line 4: N rollouts, of the best policy
+        batches, older = self.to_learn_from(experience, region)
 
         model = self.representation.update(experience)  # line 5: MODELUPDATE, section 3
         states, older_states = self.embedded(batches, older)
@@ -43,12 +42,13 @@ class Solar(LocalLearner):
         update = improve_policy(  # line 8: POLICYUPDATE, section 4.2 and appendix A
             previous.policy, dynamics.model, cost.model, bound, self.std_bounds()
         )
-        promised = promised_fall(previous.policy, update.policy, dynamics.model, cost.model)
         return {
             **model,
             **dynamics.metrics,
             **cost.metrics,
             **self.checked(states, older_states),
             "linearisation_residual": previous.residual,
-            **self.adopt(region, previous.policy, promised, update, states.reached),
+            **self.adopt(
+                region, previous.policy, update, (dynamics.model, cost.model), states.reached
+            ),
         }

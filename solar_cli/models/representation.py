@@ -181,7 +181,8 @@ class Representation:
         before = self._before
         name = f"iteration {iteration}"
         self._latents.clear()
-        terms = self._trainer.fit(name, self._model, recent, steps, fine_tuning=True)
+        count = sum(len(episodes) for episodes in newest)
+        terms = self._trainer.fit(name, self._model, recent, steps, newest=count)
         self._before = None
         self._conclude(recent)
         kills = self._alive(before.metrics) and not self._alive(self._judge(newest))

@@ -44,14 +44,14 @@ class Trainer:
         batches: list[Episodes],
         steps: int,
         *,
-        fine_tuning: bool = False,
+        newest: int = 0,
     ) -> dict[str, float]:
         """Train for ``steps`` steps; smoothed ELBO terms. The prior is to be concluded then.
 
         ``name`` keys the run's random draws; a run of that name that was interrupted goes on.
-        When fine-tuning, half of the segments come from the newest batch.
+        When fine-tuning, half of the segments come from the ``newest`` episodes, the last ones.
         """
-        data = Dataset(batches, self.device)
+        data, fine_tuning = Dataset(batches, self.device, newest), newest > 0
         optimiser = torch.optim.Adam(
             model.networks.parameters(), lr=self.settings.learning_rate, fused=True
         )
@@ -67,7 +67,7 @@ class Trainer:
                 group["lr"] = self._rate(share, fine_tuning)
             draws = self.streams.generator("minibatch", name, running["step"])
             latent = model.networks.settings.latent
-            batch = data.minibatch(self.settings, draws, latent, fine_tuning)
+            batch = data.minibatch(self.settings, draws, latent)
             weight = self.settings.kl_end if fine_tuning else self._kl_weight(share)
             running["step"] += 1
             place = f"step {running['step']} of {name}"
@@ -155,10 +155,10 @@ class Dataset:
     Segments are of live steps only; an episode that ended before it was as long as one has none.
     """
 
-    def __init__(self, batches: list[Episodes], device: str) -> None:
+    def __init__(self, batches: list[Episodes], device: str, newest: int = 0) -> None:
         self.device = device
         self.episodes = Episodes.joined(batches)
-        self.newest = len(batches[-1])
+        self.newest = newest
         if (longest := self.episodes.lengths.max()) < self.episodes.window:
             raise SolarError(
                 f"none of {len(self.episodes)} episodes lasts longer than {longest} steps: there "
@@ -168,10 +168,8 @@ class Dataset:
         self.frames = torch.from_numpy(self.episodes.frames).to(device).flatten(0, 1)
         self.actions = torch.from_numpy(self.episodes.actions).to(device).flatten(0, 1)
 
-    def minibatch(
-        self, settings: Training, stream: np.random.Generator, latent: int, favour_newest: bool
-    ) -> Minibatch:
-        """Random segments; with ``favour_newest`` half of them from the newest batch."""
+    def minibatch(self, settings: Training, stream: np.random.Generator, latent: int) -> Minibatch:
+        """Random segments, half of them from the ``newest`` episodes where there are any."""
         length = min(settings.length, int(self.episodes.lengths.max()) + 1)
         segments = settings.segments
         firsts = self._firsts(length)
@@ -179,7 +177,7 @@ class Dataset:
         often = firsts // np.gcd.reduce(firsts)
         tickets = np.repeat(np.arange(len(firsts)), often)
         drawn = stream.integers(len(tickets), size=segments)
-        if favour_newest and (newest := int(often[-self.newest :].sum())):
+        if self.newest and (newest := int(often[-self.newest :].sum())):
             half = segments // 2
             drawn[:half] = len(tickets) - 1 - stream.integers(newest, size=half)
         rows = tickets[drawn]

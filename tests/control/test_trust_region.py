@@ -25,6 +25,13 @@ def tried(iteration: int, cost: float, error: float = 1.0) -> Anchor:
     return Anchor((Batch(iteration, 0),), GAINS, cost, error)
 
 
+def batch(iteration: int, call: int, costs: np.ndarray) -> Episodes:
+    """Episodes of these costs (N, T)."""
+    actions = np.zeros((*costs.shape, 1))
+    frames = np.zeros((len(costs), costs.shape[1] + 1, 1))
+    return Episodes(frames, actions, actions, costs, batch=Batch(iteration, call))
+
+
 def region(**changes) -> TrustRegion:
     return TrustRegion(StepSize(low=0.3, high=2.0), **changes)
 
@@ -39,8 +46,7 @@ def after(*costs: float, tolerance=1.0, error=1.0) -> TrustRegion:
 
 def test_a_batch_is_judged_by_the_sums_of_its_episodes():
     costs = np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 9.0]])
-    zeros = np.zeros((3, 2, 1))
-    anchor = Anchor.of(Batch(4, 0), GAINS, Episodes(np.zeros((3, 3, 1)), zeros, zeros, costs))
+    anchor = Anchor.of(GAINS, batch(4, 0, costs))
     assert anchor.iteration == 4
     assert anchor.gains is GAINS
     assert anchor.cost == pytest.approx((3 + 7 + 14) / 3)
@@ -49,9 +55,7 @@ def test_a_batch_is_judged_by_the_sums_of_its_episodes():
 
 
 def test_one_episode_has_no_error():
-    zeros = np.zeros((1, 2, 1))
-    episodes = Episodes(np.zeros((1, 3, 1)), zeros, zeros, np.ones((1, 2)))
-    assert Anchor.of(Batch(1, 0), GAINS, episodes) == tried(1, 2.0, 0.0)
+    assert Anchor.of(GAINS, batch(1, 0, np.ones((1, 2)))) == tried(1, 2.0, 0.0)
 
 
 def test_the_first_batch_is_the_best_and_the_one_to_build_upon():
@@ -87,10 +91,10 @@ def test_a_batch_that_is_worse_by_more_is_taken_back():
 
 
 def test_further_episodes_belong_to_what_is_built_upon():
-    state = after(10.0, 20.0).gathered(Batch(2, 1))  # the second was taken back
+    state = after(10.0, 20.0).gathered(batch(2, 1, np.ones((2, 2))))  # the second was taken back
     assert state.built_upon.batches == state.best.batches == (Batch(1, 0), Batch(2, 1))
     assert state.built_upon.iteration == 1
-    state = after(10.0, 11.4).gathered(Batch(2, 1))  # built upon, but not the best
+    state = after(10.0, 11.4).gathered(batch(2, 1, np.ones((2, 2))))  # built upon, but not the best
     assert state.built_upon.batches == (Batch(2, 0), Batch(2, 1))
     assert state.best.batches == (Batch(1, 0),)
 
@@ -213,6 +217,7 @@ def test_a_promise_is_the_fall_of_what_is_collected():
         LinearGaussianPolicy(*map(torch.as_tensor, now)),
         LinearDynamics(*map(torch.as_tensor, (F, f, Sigma, mu0, Sigma0))),
         QuadraticCost(*map(torch.as_tensor, (C, c, b))),
+        noisy=True,
     )
     assert found == pytest.approx(collected(*before) - collected(*now), rel=1e-9)
 
@@ -233,7 +238,8 @@ def test_an_update_is_handed_over_untried_for_a_fifth_of_what_was_gained():
 @pytest.mark.parametrize("costs", [(), (10.0,), (10.0, 11.0), (10.0, 20.0)])
 def test_a_saved_trust_region_goes_on_as_it_would_have(costs):
     state = after(*costs)
-    state = state.gathered(Batch(len(costs), 1)) if costs else state
+    if costs:
+        state = state.gathered(batch(len(costs), 1, np.ones((2, 2))))
     buffer = io.BytesIO()
     torch.save(state.state_dict(), buffer)
     buffer.seek(0)

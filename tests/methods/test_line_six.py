@@ -39,8 +39,8 @@ def before_the_update(tmp_path, linearise: str):
     run = Run(tmp_path, "solar", *sets).iterate(1, 2)
     run.environment.begin(3)
     experience = Experience(run.environment)
-    region = run.learner.collect(experience)
-    [batch] = run.learner.batches(experience, region)[0]
+    region = run.learner.collect_and_judge(experience)
+    [batch] = run.learner.to_learn_from(experience, region)[0]
     return run, region, batch
 
 
@@ -140,10 +140,8 @@ def test_the_best_policy_collects_again_on_the_latents_of_now(tmp_path):
     assert run.learner.representation.moved_in == 2
     best, again = Batch(2, 1), Batch(3, 1)
     run.environment.begin(3)
-    region = run.learner.collect(Experience(run.environment))
-    assert region.rejections
-    run.learner.handed = run.learner._best_of_now(
-        Experience(run.environment), run.learner.trust_region
-    )
+    experience, learner = Experience(run.environment), run.learner
+    assert learner.collect_and_judge(experience).rejections
+    learner.handed = learner._best_of_now(experience, learner.trust_region)
     assert change(run, run.environment.batch(best)) < 0.2
     assert change(run, run.environment.batch(again)) < 1e-3

@@ -16,11 +16,19 @@ from solar_cli.streams import Streams
 both = pytest.mark.parametrize("name", ["solar", "vae"])
 
 
+NOISE_FREE = "batches={ initial = 8, noisy = 5, noise_free = 3 }"
+
+
 def spied(monkeypatch, name):
     """Arguments of every call of a function of Algorithm 1's page."""
     page = local if hasattr(local, name) else solar
     calls, function = [], getattr(page, name)
-    monkeypatch.setattr(page, name, lambda *given: calls.append(given) or function(*given))
+
+    def called(*given, **named):
+        calls.append(given)
+        return function(*given, **named)
+
+    monkeypatch.setattr(page, name, called)
     return calls
 
 
@@ -45,10 +53,21 @@ def test_an_update_that_promises_little_is_tried_before_it_is_handed_over(
     for handed, part in zip(run.learner.policy.gains, expected, strict=True):
         assert torch.equal(handed, part)
     run.environment.begin(3)
-    run.learner.collect(Experience(run.environment))
+    run.learner.collect_and_judge(Experience(run.environment))
     z, _ = run.learner.embedded([run.environment.collected(3)], [])
     means = torch.einsum("tij,ntj->nti", newest.K, z.z[:, :-1]) + newest.k
     torch.testing.assert_close(z.action_means, means)  # the newest is what is tried
+
+
+@both
+def test_noise_alone_is_no_promise_of_what_has_none(tmp_path, monkeypatch, name):
+    """Two policies that differ in their noise alone are the same where none is drawn."""
+    calls = spied(monkeypatch, "promised_fall")
+    Run(tmp_path, name, NOISE_FREE).iterate(1, 1)
+    previous, _, *model = calls[0]
+    louder = previous._replace(S=4 * previous.S)
+    assert trust_region.promised_fall(louder, previous, *model, noisy=True) > 0
+    assert trust_region.promised_fall(louder, previous, *model, noisy=False) == 0
 
 
 # Collecting
@@ -64,7 +83,7 @@ def test_batches_are_those_of_the_card(tmp_path, name):
 def test_the_first_batch_is_white_noise_of_the_cards_std(tmp_path):
     run = Run(tmp_path, "solar", "batches={ initial = 200, noisy = 4 }")
     run.environment.begin(1)
-    run.learner.collect(Experience(run.environment))
+    run.learner.collect_and_judge(Experience(run.environment))
     first = run.environment.collected(1)
     assert not first.action_means.any()
     std = run.configuration.task.exploration.std
@@ -113,22 +132,32 @@ def test_where_episodes_without_noise_reject_a_policy_the_best_collects_again(
     tmp_path, monkeypatch
 ):
     dynamics = spied(monkeypatch, "infer_dynamics")
-    sets = ("batches={ initial = 8, noisy = 5, noise_free = 3 }", "local_fit.older_batches=2")
-    worse = {2: 1e3, 3: 1e3}
+    worse = {2: -1.0, 3: 1e3, 4: 1e3, 5: 1e3, 6: 1e3}
     costs = lambda iteration, costs: costs + worse.get(iteration, 0.0)  # noqa: E731
-    run = Run(tmp_path, "solar", *sets, costs=costs).iterate(1, 3)
-    batch = lambda *names: Episodes.joined([run.environment.batch(Batch(*n)) for n in names])  # noqa: E731
-    assert not batch((2, 1), (3, 1)).action_means.any()  # the first policy, not the newest
-    assert batch((2, 0), (3, 0)).action_means.any()
-    of_the_best, older = dynamics[2][:2]
-    expected = batch((1, 0), (1, 1), (2, 1), (3, 1))
+    run = Run(tmp_path, "solar", NOISE_FREE, costs=costs).iterate(1, 4)
+    quiet = lambda iteration: Batch(iteration, 0, noisy=False)  # noqa: E731
+    batch = lambda *names: Episodes.joined([run.environment.batch(name) for name in names])  # noqa: E731
+    best = run.learner.trust_region.best.gains
+    for iteration in (3, 4):
+        again = batch(Batch(iteration, 1))
+        z, _ = run.learner.embedded([again], [])
+        means = torch.einsum("tij,ntj->nti", best.K, z.z[:, :-1]) + best.k
+        torch.testing.assert_close(z.action_means, means)
+        assert not np.allclose(batch(quiet(iteration)).action_means, again.action_means[:3])
+    of_the_best, older = dynamics[3][:2]
+    expected = batch(quiet(2), Batch(2, 1), Batch(3, 1), Batch(4, 1))
     np.testing.assert_array_equal(of_the_best.actions, expected.actions)
-    assert len(older) == 2
-    for found, name in zip(older, [(3, 0), (2, 0)], strict=True):
-        np.testing.assert_array_equal(found.actions, batch(name).actions)
-    assert run.learner.trust_region.best.cost == batch((1, 0)).costs.sum(axis=1).mean()
-    run.iterate(4, 4)
-    assert run.learner.trust_region.current.batches == (Batch(4, 0), Batch(4, 1))
+    # What is left of a rejected iteration has no noise, and says nothing of what actions do.
+    np.testing.assert_array_equal(older[0].actions, batch(quiet(1), Batch(1, 1)).actions)
+    assert len(older) == 1
+    assert run.learner.trust_region.best.cost == batch(quiet(2)).costs.sum(axis=1).mean()
+    run.iterate(5, 6)
+    of_the_best, older = dynamics[5][:2]  # the last four of it
+    expected = batch(*(Batch(iteration, 1) for iteration in (3, 4, 5, 6)))
+    np.testing.assert_array_equal(of_the_best.actions, expected.actions)
+    np.testing.assert_array_equal(older[0].actions, batch(quiet(2), Batch(2, 1)).actions)
+    run.iterate(7, 7)
+    assert run.learner.trust_region.current.batches == (quiet(7), Batch(7, 1))
 
 
 def test_without_rejection_the_newest_batch_is_built_upon(tmp_path):
@@ -193,9 +222,13 @@ def test_without_a_kl_bound_the_update_is_the_unconstrained_one(tmp_path, monkey
 @both
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 @pytest.mark.parametrize("iteration", [1, 2])
-def test_a_cost_that_is_not_finite_is_divergence(tmp_path, name, value, iteration):
-    broken = of_iteration(iteration, lambda costs: costs * value)
-    run = Run(tmp_path, name, costs=broken).iterate(1, iteration - 1)
+@pytest.mark.parametrize("noisy", [False, True])
+def test_a_cost_that_is_not_finite_is_divergence(tmp_path, name, value, iteration, noisy):
+    """Of three episodes without noise that judge, or of the five others."""
+    broken = of_iteration(
+        iteration, lambda costs: costs * (value if (len(costs) > 3) == noisy else 1)
+    )
+    run = Run(tmp_path, name, NOISE_FREE, costs=broken).iterate(1, iteration - 1)
     with pytest.raises(Diverged, match=f"iteration {iteration}"):
         run.iterate(iteration, iteration)
 

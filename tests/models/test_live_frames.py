@@ -50,10 +50,10 @@ def spoilt(episodes: Episodes, rubbish: float) -> Episodes:
     return episodes
 
 
-def draws(data: Dataset, steps=1, favour_newest=False, length=3):
+def draws(data: Dataset, steps=1, length=3):
     settings = Training(segments=4, length=length)
     for step in range(steps):
-        yield data.minibatch(settings, np.random.default_rng(step), d, favour_newest)
+        yield data.minibatch(settings, np.random.default_rng(step), d)
 
 
 # What a step draws
@@ -75,10 +75,10 @@ def test_every_segment_of_live_frames_is_equally_likely():
 
 
 def test_half_of_the_segments_of_fine_tuning_are_new():
-    data = Dataset([ended(), ended([5, 1, 4])], "cpu")
+    data = Dataset([ended(), ended([5, 1, 4])], "cpu", newest=3)
     frames = data.frames.unflatten(0, (-1, T + 1))
     frames[len(LENGTHS) :, :, 0] += 100  # the newest batch says so
-    for batch in draws(data, 30, favour_newest=True):
+    for batch in draws(data, 30):
         assert int((batch.frames[:, 0, 0] >= 100).sum()) >= 2
 
 

@@ -170,9 +170,9 @@ def labelled(count: int, task=TASK) -> Episodes:
     return Episodes(frames, actions, actions, np.zeros((count, task.horizon)))
 
 
-def draw(data: Dataset, step=0, favour_newest=False, **changes):
+def draw(data: Dataset, step=0, **changes):
     stream = Streams(0).generator("minibatch", NAME, step)
-    return data.minibatch(settings(**changes), stream, 2, favour_newest)
+    return data.minibatch(settings(**changes), stream, 2)
 
 
 def test_segments_are_consecutive_frames_of_one_episode_with_their_actions():
@@ -216,12 +216,9 @@ def test_a_share_of_the_frames_is_decoded_each_once(share, count):
 
 
 def test_half_of_the_segments_of_fine_tuning_are_new():
-    data = Dataset([labelled(20), labelled(4)], "cpu")
+    data = Dataset([labelled(20), labelled(4)], "cpu", newest=4)
     data.frames.unflatten(0, (24, -1))[20:, :, 0] += 100  # the newest batch says so
-    new = [
-        int((draw(data, step, favour_newest=True, segments=10).frames[:, 0, 0] >= 100).sum())
-        for step in range(40)
-    ]
+    new = [int((draw(data, step, segments=10).frames[:, 0, 0] >= 100).sum()) for step in range(40)]
     assert min(new) >= 5
     # The other half is drawn from all 24, of which 4 are new.
     assert np.mean(new) == pytest.approx(5 + 5 * 4 / 24, abs=5 * math.sqrt(5 * 0.14 / 40))
@@ -252,7 +249,7 @@ def test_the_scale_makes_a_minibatch_as_large_as_the_data(window):
 # What a step weighs
 
 
-def weights_and_rates(steps: int, fine_tuning=False, **changes):
+def weights_and_rates(steps: int, newest=0, **changes):
     """KL weight and learning rate of every step."""
     model, weights, rates = untrained(), [], []
     loss = model.loss
@@ -268,7 +265,7 @@ def weights_and_rates(steps: int, fine_tuning=False, **changes):
         rates.append(group["lr"])
 
     own = trainer(pulse, **changes)
-    own.fit(NAME, model, [EPISODES], steps, fine_tuning=fine_tuning)
+    own.fit(NAME, model, [EPISODES], steps, newest=newest)
     return weights, rates
 
 
@@ -281,7 +278,7 @@ def test_the_kl_weight_is_held_then_rises_linearly(monkeypatch):
     assert weights == pytest.approx([0.1, 0.1, 1.1, 1.1])
     weights, _ = weights_and_rates(4, **schedule | {"kl_hold": 0.0, "kl_ramp": 1.0})
     assert weights == pytest.approx([0.1, 0.35, 0.6, 0.85])
-    weights, _ = weights_and_rates(3, fine_tuning=True, **schedule)
+    weights, _ = weights_and_rates(3, newest=2, **schedule)
     assert weights == [1.1, 1.1, 1.1]
 
 
@@ -292,7 +289,7 @@ def test_the_learning_rate_falls_as_a_cosine_or_stays(monkeypatch):
     assert rates == pytest.approx([0.01, half, 0.005, 0.01 - half])
     _, rates = weights_and_rates(3, learning_rate=0.01, schedule="constant")
     assert rates == [0.01] * 3
-    _, rates = weights_and_rates(3, learning_rate=0.01, fine_tune_rate=0.003, fine_tuning=True)
+    _, rates = weights_and_rates(3, learning_rate=0.01, fine_tune_rate=0.003, newest=2)
     assert rates == [0.003] * 3
 
 
