@@ -90,7 +90,7 @@ class LocalLearner(ABC):
 
     @property
     def policy(self) -> LatentPolicy:
-        """The newest policy, or the one that it was made from where it promises little."""
+        """The newest policy, or the best that was tried where it promises little."""
         return self._acting(self.handed)
 
     def _acting(self, gains: LinearGaussianPolicy) -> LatentPolicy:
@@ -147,7 +147,7 @@ class LocalLearner(ABC):
 
     def _best_of_now(self, experience: Experience, region: TrustRegion) -> LinearGaussianPolicy:
         """The policy that is built upon, on the latents of now."""
-        if not self._needs_line_six(region):
+        if not self._needs_line_six(region.built_upon):
             return region.built_upon.gains
         states, _ = self.embedded(self.to_learn_from(experience, region)[0], [])
         gains = LocalLearner.linearised(self, region, states).policy
@@ -201,13 +201,13 @@ class LocalLearner(ABC):
         changed them.
         """
         gains = region.built_upon.gains.until(states.live.shape[1])
-        if self._needs_line_six(region):
+        if self._needs_line_six(region.built_upon):
             return linearise_policy(states.z[:, :-1], states.action_means, states.live, gains)
         return Linearisation(gains, residual=0.0, ridge=0.0)
 
-    def _needs_line_six(self, region: TrustRegion) -> bool:
-        """Whether latents have changed since the policy that is built upon first acted."""
-        moved = self.representation.moved_in >= region.built_upon.iteration
+    def _needs_line_six(self, anchor: Anchor) -> bool:
+        """Whether latents have changed since this policy first acted."""
+        moved = self.representation.moved_in >= anchor.iteration
         return moved and self.settings.update.linearise
 
     def infer_dynamics(
@@ -253,7 +253,7 @@ class LocalLearner(ABC):
             for noisy in (not self.settings.batches.noise_free, False)
         )
         trusted = self.settings.update.reject == "never" or region.trusts(without_noise)
-        self.handed = self.gains if trusted else previous.held(reached, self.task.horizon)
+        self.handed = self.gains if trusted else self._best(region, previous, reached)
         self.trust_region = replace(region, promised=promised)
         self.updates += 1
         stuck = update.outcome in (Outcome.NOT_POSITIVE_DEFINITE, Outcome.BRACKET_EXHAUSTED)
@@ -265,6 +265,15 @@ class LocalLearner(ABC):
             "update_failed": float(stuck),
             "handed_over_untried": float(trusted),
         }
+
+    def _best(
+        self, region: TrustRegion, previous: LinearGaussianPolicy, reached: int
+    ) -> LinearGaussianPolicy:
+        """The best policy that was tried, or where latents have changed the one built upon."""
+        assert region.best is not None
+        if self._needs_line_six(region.best):
+            return previous.held(reached, self.task.horizon)
+        return region.best.gains
 
     def diagnose(self, evaluation: Evaluation) -> dict[str, float]:
         """R2 of linear maps between true positions and the newest latents, both ways."""
