@@ -295,10 +295,11 @@ def test_checks_of_the_task_are_stored_and_change_nothing(tmp_path, monkeypatch,
 def test_what_is_built_upon_and_older_batches_are_checked(tmp_path, monkeypatch):
     calls = spied(monkeypatch, "task_metrics")
     run = Run(tmp_path, "solar", costs=of_iteration(2, lambda costs: costs + 1e3)).iterate(1, 2)
-    newest, older, latent, action_cost = calls[1]
+    newest, older, *rest = calls[1]
     np.testing.assert_array_equal(newest.costs, run.environment.collected(1).costs)  # 2 is rejected
     np.testing.assert_array_equal(older[0].costs, run.environment.collected(2).costs)
-    assert (latent, action_cost) == (4, run.configuration.task.action_cost)
+    task = run.configuration.task
+    assert rest == [4, task.action_cost, task.action.bound]
 
 
 # Diagnosing
