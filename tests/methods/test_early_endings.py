@@ -83,6 +83,34 @@ def test_an_update_is_planned_for_what_was_lived(tmp_path, monkeypatch):
         assert all(torch.equal(later, known[reached - 1]) for later in part[reached:])
 
 
+@both
+def test_the_best_that_collects_again_goes_on_from_what_was_reached(tmp_path, name):
+    """On latents that have moved since it first acted, so that its gains are fitted anew."""
+    sets = ("training.fine_tune_steps=4", "batches={ initial = 8, noisy = 5, noise_free = 3 }")
+    done = Run(
+        tmp_path,
+        name,
+        *sets,
+        wrap=lambda task: Ending(task, 0),
+        costs=lambda iteration, costs: costs + {2: -1.0, 3: 1e3}.get(iteration, 0.0),
+    )
+    collect, tried = done.environment.collect, []
+    done.environment.collect = lambda policy, *rest, **more: (
+        tried.append(policy.gains) or collect(policy, *rest, **more)
+    )
+    done.iterate(1, 3)
+    assert [metrics["rejected"] for metrics in done.metrics] == [0.0, 0.0, 1.0]
+    best, again = tried[2], tried[-1]
+    lengths = done.environment.collected(2).lengths
+    reached = int(np.sort(lengths)[len(lengths) // 2])
+    assert 1 < reached < 6
+    assert len(again.k) == len(best.k) == 6
+    assert not torch.equal(again.K[reached - 1], best.K[reached - 1])
+    assert not torch.equal(again.K[reached - 2], again.K[reached - 1])
+    for part in again:
+        assert all(torch.equal(later, part[reached - 1]) for later in part[reached:])
+
+
 def test_what_steps_after_the_end_cost_counts_for_the_policy(tmp_path):
     done = run(tmp_path, "solar")
     best = done.learner.trust_region.best
