@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from bits import digest
+from collected_episodes import collected_in
 from method_runs import Run
 
 from solar_cli.methods import solar
@@ -45,7 +46,7 @@ def run(folder, name, rubbish=0, *sets):
 @both
 def test_episodes_end_early_and_learning_goes_on(tmp_path, name):
     done = run(tmp_path, name)
-    lengths = np.concatenate([done.environment.collected(i).lengths for i in (1, 2, 3)])
+    lengths = np.concatenate([collected_in(i, done.environment).lengths for i in (1, 2, 3)])
     assert set(lengths.tolist()) == {2, 3, 4, 5, 6}
     assert all(np.isfinite(list(metrics.values())).all() for metrics in done.metrics)
     assert all(bool(torch.isfinite(part).all()) for part in done.learner.gains)
@@ -72,7 +73,7 @@ def test_an_update_is_planned_for_what_was_lived(tmp_path, monkeypatch):
     done = run(tmp_path, "solar")
     for iteration, ((previous, dynamics, _, bound, _), update) in enumerate(plans, start=1):
         region = done.learner.trust_region
-        lengths = done.environment.collected(iteration).lengths
+        lengths = collected_in(iteration, done.environment).lengths
         steps = int(np.sort(lengths)[-2])
         assert len(previous.k) == len(dynamics.f) == len(update.policy.k) == steps
         assert bound <= 0.5 * steps * region.step.high
@@ -101,7 +102,7 @@ def test_the_best_that_collects_again_goes_on_from_what_was_reached(tmp_path, na
     done.iterate(1, 3)
     assert [metrics["rejected"] for metrics in done.metrics] == [0.0, 0.0, 1.0]
     best, again = tried[2], tried[-1]
-    lengths = done.environment.collected(2).lengths
+    lengths = collected_in(2, done.environment).lengths
     reached = int(np.sort(lengths)[len(lengths) // 2])
     assert 1 < reached < 6
     assert len(again.k) == len(best.k) == 6
@@ -114,7 +115,7 @@ def test_the_best_that_collects_again_goes_on_from_what_was_reached(tmp_path, na
 def test_what_steps_after_the_end_cost_counts_for_the_policy(tmp_path):
     done = run(tmp_path, "solar")
     best = done.learner.trust_region.best
-    episodes = done.environment.collected(best.iteration)
+    episodes = collected_in(best.iteration, done.environment)
     lived = np.where(episodes.live_steps, episodes.costs, 0.0).sum(axis=1)
     expected = (lived + 3.0 * (episodes.horizon - episodes.lengths)).mean()
     assert best.cost == pytest.approx(expected, rel=1e-12)
