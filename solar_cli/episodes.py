@@ -309,10 +309,6 @@ class Environment:
                 self._ledger.append(made)
         return self._hold(key, found)
 
-    def collected(self, iteration: int) -> Episodes:
-        """All episodes of one iteration."""
-        return Episodes.joined([self._get(e) for e in self._ledger if e["iteration"] == iteration])
-
     def batches(self) -> list[Batch]:
         """All that was collected, oldest first."""
         return [_name(entry) for entry in self._ledger]

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from collected_episodes import collected_in
 
 from solar_cli.envs import build_task
 from solar_cli.episodes import (
@@ -284,7 +285,7 @@ def test_lengths_survive_their_file_and_go_where_episodes_go(ending: Environment
     parts = [ending.collect(Pull(gain=0.0, std=0.4), count) for count in (20, 10)]
     fresh = again(ending, 1)
     fresh._task = Ending()
-    assert_equal_bits(fresh.collected(1), Episodes.joined(parts))
+    assert_equal_bits(collected_in(1, fresh), Episodes.joined(parts))
     rows = np.array([25, 3])
     joined = Episodes.joined(parts)
     np.testing.assert_array_equal(joined[rows].lengths, [parts[1].lengths[5], parts[0].lengths[3]])
@@ -329,7 +330,7 @@ def test_collected_episodes_count_once(environment: Environment):
     environment.begin(2)  # the iteration is repeated
     environment.collect(Pull(), 3)
     assert (environment.episodes, environment.steps) == (9, 9 * T)
-    assert [len(environment.collected(iteration)) for iteration in (1, 2)] == [6, 3]
+    assert [len(collected_in(iteration, environment)) for iteration in (1, 2)] == [6, 3]
 
 
 def test_a_repeated_iteration_finds_what_it_collected(environment: Environment):
@@ -349,7 +350,7 @@ def test_recent_batches_are_those_of_the_last_iterations_oldest_first(environmen
     expected = [*batches[3], *batches[4]]
     for found, batch in zip(environment.recent(2), expected, strict=True):
         assert_equal_bits(found, batch)
-    assert_equal_bits(environment.collected(2), Episodes.joined(batches[2]))
+    assert_equal_bits(collected_in(2, environment), Episodes.joined(batches[2]))
     assert [len(batch) for batch in environment.recent(1)] == [4, 1]
     assert [len(batch) for batch in environment.recent(10)] == [1, 1, 2, 1, 3, 1, 4, 1]
     environment.begin(2)  # what was collected later is not there yet
@@ -429,7 +430,7 @@ def test_a_file_gives_back_what_was_collected(environment: Environment):
     environment.begin(1)
     collected = [environment.collect(Pull(), 3), environment.collect(Pull(), 2, noisy=False)]
     fresh = again(environment, 1)
-    assert_equal_bits(fresh.collected(1), Episodes.joined(collected))
+    assert_equal_bits(collected_in(1, fresh), Episodes.joined(collected))
     assert fresh.summary(1) == environment.summary(1)
 
 
@@ -515,7 +516,7 @@ def test_a_damaged_file_of_an_older_iteration_is_refused(environment: Environmen
     fresh = again(environment, 2)
     assert len(fresh.collect(Pull(), 3)) == 3
     assert [len(batch) for batch in fresh.recent(1)] == [3]
-    for ask in (lambda: fresh.recent(2), lambda: fresh.collected(1)):
+    for ask in (lambda: fresh.recent(2), lambda: collected_in(1, fresh)):
         with pytest.raises((SolarError, OSError), match=r"0001-0\.npz.*damaged.*--redo"):
             ask()
 
@@ -526,7 +527,7 @@ def test_frames_of_long_ago_leave_memory_and_are_read_again(environment: Environ
     for iteration in range(1, HELD + 6):
         environment.begin(iteration)
         collected = environment.collect(Pull(), 2)
-        environment.collected(1)  # asked for every time
+        collected_in(1, environment)  # asked for every time
         held.append(weakref.ref(collected))
         starts.append(collected.frames[:, 0].copy())
     del collected

@@ -76,6 +76,22 @@ class _Moments(NamedTuple):
     n: Float[Tensor, "*k"]
     """samples"""
 
+    @staticmethod
+    def of(
+        z: Float[Tensor, "N T m"], costs: Float[Tensor, "N T"], live: Bool[Tensor, "N T"]
+    ) -> _Moments:
+        """Of every time step, over the episodes that were still running."""
+        over = ~live.T
+        x = _monomials(z.transpose(0, 1)).masked_fill(over.unsqueeze(-1), 0.0)
+        y = costs.T.masked_fill(over, 0.0)
+        xy = (x.mT @ y.unsqueeze(-1)).squeeze(-1)
+        return _Moments(x.mT @ x, xy, y.square().sum(dim=1), live.sum(dim=0).to(y))
+
+    @staticmethod
+    def stacked(parts: Sequence[_Moments]) -> _Moments:
+        """Of several fits, the new first axis."""
+        return _Moments(*map(torch.stack, zip(*parts, strict=True)))
+
     def error(self, quadratic: _Quadratic) -> Float[Tensor, "*k"]:
         """Sum of squared errors."""
         w = quadratic.coefficients()
@@ -88,8 +104,8 @@ class _Moments(NamedTuple):
         """The same done to all of them."""
         return _Moments(*(change(part) for part in self))
 
-    def over_time(self) -> _Moments:
-        """All time steps, the first axis, together."""
+    def together(self) -> _Moments:
+        """Of the samples of all fits of the first axis: time steps, or folds."""
         return self.each(lambda part: part.sum(dim=0))
 
     def plus(self, other: _Moments) -> _Moments:
@@ -122,7 +138,8 @@ class FittedCost(NamedTuple):
 
     model: QuadraticCost
     r2: float
-    """share of the variance of held-out costs that is explained"""
+    """share of the variance of held-out costs that is explained; by a fit per time step, after
+    `COMPARED_ROUNDS` of it"""
     choice: Choice
 
     @property
@@ -145,24 +162,22 @@ def fit_quadratic_cost(
     ``older`` batches may support the shared fit. The cost of the last state, which is never
     observed, is the last fit's times ``settings.terminal``.
     """
-    y = states.costs - action_cost * states.actions.square().sum(dim=-1)
-    mean, scale = y[states.live].mean(), y[states.live].std().clamp_min(1e-9)
-    fold = torch.arange(len(y)) % min(FOLDS, len(y))
+    costs = _of_states(states, action_cost)
+    mean, scale = costs[states.live].mean(), costs[states.live].std().clamp_min(1e-9)
+    fold = torch.arange(len(costs)) % min(FOLDS, len(costs))
 
-    def moments(batch: Trajectories) -> _Moments:
-        y = batch.costs - action_cost * batch.actions.square().sum(dim=-1)
-        return _moments(batch.z[:, :-1, :features], (y - mean) / scale, batch.live)
+    def standardised(batch: Trajectories) -> _Moments:
+        """Of every time step."""
+        y = (_of_states(batch, action_cost) - mean) / scale
+        return _Moments.of(batch.z[:, :-1, :features], y, batch.live)
 
-    folds = [
-        moments(Trajectories(*(part[fold == k] for part in states)))
-        for k in range(int(fold.max()) + 1)
-    ]
-    past = [moments(batch).over_time() for batch in older]
-    support = reduce(_Moments.plus, past) if past else None
-    scores = _held_out(folds, support, settings)
-    best = max(scores, key=lambda choice: scores[choice])
+    folds = [standardised(states.only(fold == k)) for k in range(int(fold.max()) + 1)]
     whole = reduce(_Moments.plus, folds)
-    shared = _fit_shared(whole.over_time(), support, [best], settings)
+    past = [standardised(batch).together() for batch in older]
+    support = reduce(_Moments.plus, past) if past else None
+    scores = _held_out(folds, whole, support, settings)
+    best = max(scores, key=lambda choice: scores[choice])
+    shared = _fit_shared(whole.together(), support, [best], settings)
     fit = _Quadratic(*(part.squeeze(0) for part in shared))
     if best.per_time:
         fit = _fit_each(whole, fit, settings, LBFGS_ROUNDS)
@@ -170,47 +185,40 @@ def fit_quadratic_cost(
     return FittedCost(model, scores[best], best)
 
 
+def _of_states(batch: Trajectories, action_cost: float) -> Float[Tensor, "N T"]:
+    """Costs without the action's part."""
+    return batch.costs - action_cost * batch.actions.square().sum(dim=-1)
+
+
 def _held_out(
-    folds: list[_Moments], support: _Moments | None, settings: CostFit
+    folds: list[_Moments], whole: _Moments, support: _Moments | None, settings: CostFit
 ) -> dict[Choice, float]:
-    """R2 of every choice on the episodes that a fit was not given.
+    """R2 of every choice on the episodes that a fit was not given; ``whole`` is of all folds.
 
     Whether fits per time step are better is asked of the best shared one only.
     """
-    judges = _stacked([fold.over_time() for fold in folds])
-    learned = judges.each(lambda part: part.sum(dim=0) - part) if len(folds) > 1 else judges
+
+    def given(judges: _Moments, every: _Moments) -> _Moments:
+        """What fits are made from: all but what judges them, unless there is nothing else."""
+        return every.minus(judges) if len(folds) > 1 else judges
+
+    judges = _Moments.stacked([fold.together() for fold in folds])
     weights = settings.older if support is not None else (0.0,)
     choices = [Choice(w, ridge, per_time=False) for w, ridge in product(weights, settings.ridge)]
     spread = float(judges.yy.sum())
     if spread <= 1e-12 * float(judges.n.sum()):  # nothing to explain
         return dict.fromkeys(choices, 1.0)
-    fits = _fit_shared(learned, support, choices, settings)
+    fits = _fit_shared(given(judges, judges.together()), support, choices, settings)
     r2 = 1 - judges.error(fits).sum(dim=1) / spread
     scores = dict(zip(choices, r2.tolist(), strict=True))
     if settings.per_time == "never":
         return scores
-    best, whole, error = int(r2.argmax()), reduce(_Moments.plus, folds), 0.0
+    best, error = int(r2.argmax()), 0.0
     for k, fold in enumerate(folds):  # not all at once: moments of every time step fill the memory
         shared = _Quadratic(*(part[best, k] for part in fits))
-        given = whole.minus(fold) if len(folds) > 1 else whole
-        error += float(fold.error(_fit_each(given, shared, settings, COMPARED_ROUNDS)).sum())
+        fit = _fit_each(given(fold, whole), shared, settings, COMPARED_ROUNDS)
+        error += float(fold.error(fit).sum())
     return {**scores, choices[best]._replace(per_time=True): 1 - error / spread}
-
-
-def _stacked(parts: list[_Moments]) -> _Moments:
-    """Of several fits."""
-    return _Moments(*map(torch.stack, zip(*parts, strict=True)))
-
-
-def _moments(
-    z: Float[Tensor, "N T m"], target: Float[Tensor, "N T"], live: Bool[Tensor, "N T"]
-) -> _Moments:
-    """Of every time step, over the episodes that were still running."""
-    over = ~live.T
-    x = _monomials(z.transpose(0, 1)).masked_fill(over.unsqueeze(-1), 0.0)
-    y = target.T.masked_fill(over, 0.0)
-    xy = (x.mT @ y.unsqueeze(-1)).squeeze(-1)
-    return _Moments(x.mT @ x, xy, y.square().sum(dim=1), live.sum(dim=0).to(y))
 
 
 def _fit_shared(
@@ -223,12 +231,12 @@ def _fit_shared(
 
     ``support`` are moments of older batches.
     """
-    axes = (1,) * moments.n.ndim
-    older, ridge = moments.n.new_tensor([choice[:2] for choice in choices]).T.view(2, -1, *axes)
-    whole = moments.each(lambda part: part.expand(len(choices), *part.shape))
+    weights = moments.n.new_tensor([choice[:2] for choice in choices])
+    older, ridge = weights.T.view(2, len(choices), *(1,) * moments.n.ndim)
+    samples = moments.each(lambda part: part.expand(len(choices), *part.shape))
     if support is not None:
-        whole = whole.plus(support.each(lambda part: _times(older, part)))
-    mean = whole.mean()
+        samples = samples.plus(support.each(lambda part: _times(older, part)))
+    mean = samples.mean()
     q, axes = mean.xy.shape[-1], mean.n.shape
     m = round((2 * q + 0.25) ** 0.5 - 1.5)  # q = m (m + 1) / 2 + m + 1
     start = _Quadratic(

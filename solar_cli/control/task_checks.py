@@ -40,15 +40,19 @@ noise: 9 to 22 for a car at a wall, 0.3 to 3.4 for one that stops where nothing 
 
 
 def task_metrics(
-    newest: Trajectories, older: Sequence[Trajectories], d: int, action_cost: float
+    newest: Trajectories,
+    older: Sequence[Trajectories],
+    d: int,
+    action_cost: float,
+    bound: float,
 ) -> dict[str, float]:
-    """Metrics of an iteration.
+    """Metrics of an iteration; actions were clipped at ``bound``.
 
     ``last_action_p_value``: of the newest block's increment being independent of the last action.
     ``action_seen_late``: 1 where it is, but not of an earlier one, else 0. ``stuck``: 1 where
     episodes come to rest above their least cost, whatever their noise, else 0.
     """
-    p_value, late = last_action([newest, *older], d)
+    p_value, late = last_action([newest, *older], d, bound)
     return {
         "last_action_p_value": p_value,
         "action_seen_late": float(late),
@@ -57,7 +61,11 @@ def task_metrics(
 
 
 class _Samples(NamedTuple):
-    """Transitions of the episodes with noise, centred per time step."""
+    """Transitions of the episodes with noise, centred per time step.
+
+    Those that an action at its bound led to are left out: what clipping leaves of its noise is a
+    function of the state.
+    """
 
     z: Float[Tensor, "n z"]
     noise: Float[Tensor, "L n a"]
@@ -68,7 +76,7 @@ class _Samples(NamedTuple):
     """degrees of freedom that centring leaves"""
 
 
-def last_action(batches: Sequence[Trajectories], d: int) -> tuple[float, bool]:
+def last_action(batches: Sequence[Trajectories], d: int, bound: float) -> tuple[float, bool]:
     """The p value of the last action, and whether an earlier one is seen in its place.
 
     F tests of nested regressions of the increments on the state and the last actions' noise, each
@@ -77,7 +85,7 @@ def last_action(batches: Sequence[Trajectories], d: int) -> tuple[float, bool]:
     effect half as strong as the strongest earlier one would have been seen. Noise that is smooth in
     time tells actions apart less well: then both may stay open, and nothing is said.
     """
-    z, noise, y, free = _joined([_samples(batch, d) for batch in batches])
+    z, noise, y, free = _joined([_samples(batch, d, bound) for batch in batches])
     entries = d * noise.shape[-1]
     free -= z.shape[-1] + ACTIONS * noise.shape[-1]
     if free < 2 * d:
@@ -102,24 +110,29 @@ def last_action(batches: Sequence[Trajectories], d: int) -> tuple[float, bool]:
     return p_value, p_value > LEVEL and would_be_seen
 
 
-def _samples(batch: Trajectories, d: int) -> _Samples:
+def _samples(batch: Trajectories, d: int, bound: float) -> _Samples:
     batch = batch.only(batch.noisy)
     x, y, live = batch.transitions(d)
     noise = (batch.actions - batch.action_means).transpose(0, 1)
-    counts, alive = live.sum(dim=1).clamp_min(1.0)[:, None, None], live > 0
+    clipped = (batch.actions.abs() >= bound).any(dim=-1).T
+
+    def delayed(part: Tensor, back: int) -> Tensor:
+        return torch.cat([torch.zeros_like(part[:back]), part])[: len(part)]
+
+    kept = live > 0
+    for back in range(ACTIONS):
+        kept = kept & ~delayed(clipped, back)
+    counts = kept.sum(dim=1).clamp_min(1)[:, None, None]
 
     def centred(part: Tensor) -> Tensor:
-        part = part * live.unsqueeze(-1)
-        return (part - part.sum(dim=1, keepdim=True) / counts)[alive]
-
-    def delayed(back: int) -> Tensor:
-        return torch.cat([torch.zeros_like(noise[:back]), noise])[: len(noise)]
+        part = part * kept.unsqueeze(-1)
+        return (part - part.sum(dim=1, keepdim=True) / counts)[kept]
 
     return _Samples(
         centred(x[..., : batch.z.shape[-1]]),
-        torch.stack([centred(delayed(back)) for back in range(ACTIONS)]),
+        torch.stack([centred(delayed(noise, back)) for back in range(ACTIONS)]),
         centred(y),
-        int(alive.sum() - alive.any(dim=1).sum()),
+        int(kept.sum() - kept.any(dim=1).sum()),
     )
 
 

@@ -36,7 +36,10 @@ def build_task(settings: TaskSettings) -> Restartable:
 
 
 def picture(settings: TaskSettings, frames: Frames, factor: int = 8) -> NDArray[np.uint8]:
-    """Learner frames (..., C, H, W) as pictures for people, RGB (..., H factor, W factor, 3)."""
+    """Learner frames (..., C, H, W) as pictures for people, RGB (..., H factor, W factor, 3).
+
+    Those of `drawable` may be given with the settings of the task that shows states, too.
+    """
     colours: NDArray[np.float64] = _simulator(settings).picture(frames, factor)
     return np.rint(255.0 * colours).astype(np.uint8)
 

@@ -64,7 +64,8 @@ class Parameters(Settings):
     names: tuple[str, ...] = setting((), "of the observation's entries, in order")
     cost: Annotated[dict[str, Term] | None, BeforeValidator(_table)] = setting(
         OWN_REWARD,
-        "of a step: minus its reward; or a table of squares of entries",
+        "of a step: minus its reward, which most environments give for the state after it; or a "
+        "table of squares of entries, of the state before it",
         validate_default=True,
     )
     ended_cost: float | None = setting(

@@ -281,7 +281,8 @@ def _make(parameters: Parameters, settings: TaskSettings) -> Any:
         )
         raise UsageError(f"task.parameters.id: Gymnasium knows no {name!r}: {hint}")
     if "mujoco" in str(gymnasium.registry[name].entry_point):
-        offscreen.load_mujoco()  # before the environment does, whatever other tasks draw with it
+        # Before the environment does, and to draw where possible: other tasks, or this one later.
+        offscreen.load_mujoco(to_draw=image)
     try:
         env = gymnasium.make(
             name,

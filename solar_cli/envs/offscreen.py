@@ -16,24 +16,41 @@ DEFAULTS = {
     "LP_NUM_THREADS": "0",
 }
 """environment, set unless the user has: libraries read it when they are loaded"""
+NO_GRAPHICS = "disabled"
+"""as ``MUJOCO_GL``"""
 MOST_GEOMS = 100
 """things that a scene may show"""
 
 
-def load_mujoco() -> Any:
-    """The package ``mujoco``. Raises `UsageError` where it or its graphics library is missing."""
+def load_mujoco(*, to_draw: bool = True) -> Any:
+    """The package ``mujoco``, with its graphics library where there is one.
+
+    Raises `UsageError` where the package is missing, or the library and it is loaded ``to_draw``.
+    """
     if "mujoco" not in sys.modules:
         for name, value in DEFAULTS.items():
             os.environ.setdefault(name, value)
     try:
         import mujoco
-    except ModuleNotFoundError as error:
-        if error.name != "mujoco":
-            raise cannot_draw(error) from error
-        raise UsageError("the package mujoco is missing here: pip install mujoco") from error
     except Exception as error:  # a graphics library that is not there shows in many ways
-        raise cannot_draw(error) from error
+        if isinstance(error, ModuleNotFoundError) and error.name == "mujoco":
+            raise UsageError("the package mujoco is missing here: pip install mujoco") from error
+        if to_draw or os.environ.get("MUJOCO_GL") == NO_GRAPHICS:
+            raise cannot_draw(error) from error
+        return _without_graphics()
+    if to_draw and not hasattr(mujoco, "GLContext"):
+        raise cannot_draw(ImportError("MuJoCo was loaded without a graphics library"))
     return mujoco
+
+
+def _without_graphics() -> Any:
+    """The package ``mujoco``, which is told for this once to look for no graphics library."""
+    before = os.environ["MUJOCO_GL"]
+    os.environ["MUJOCO_GL"] = NO_GRAPHICS
+    try:
+        return load_mujoco(to_draw=False)
+    finally:
+        os.environ["MUJOCO_GL"] = before
 
 
 def make_renderer(model: Any, height: int, width: int) -> Any:

@@ -39,8 +39,9 @@ class Task(Protocol):
     def step(self, actions: Floats) -> tuple[Frames, Floats]:
         """Execute actions (N, a): the next frames, and the costs (N,) of state and action.
 
-        The cost is that of the state before the step and of the action after clipping. An episode
-        that is over stays at its last frame; what such a step costs is the task's to say.
+        The cost is that of the state before the step and of the action after clipping; minus the
+        reward of a Gymnasium environment is mostly of the state after it. An episode that is over
+        stays at its last frame; what such a step costs is the task's to say.
         """
 
     def ended(self) -> NDArray[np.bool_]:

@@ -56,11 +56,11 @@ class Judge:
         try:
             shown = drawable(settings, DRAWN_ROWS)
             task = build_task(shown)
-        except SolarError:
+            streams = self._streams.under(iteration)
+            resets = [streams.generator("reset", i) for i in range(len(first))]
+            return roll_out(task, shown, Recorded(first.actions), resets, None).episodes.frames
+        except SolarError:  # a picture that is missing must not stop a learner
             return None
-        streams = self._streams.under(iteration)
-        resets = [streams.generator("reset", i) for i in range(len(first))]
-        return roll_out(task, shown, Recorded(first.actions), resets, None).episodes.frames
 
 
 class Recorded:

@@ -30,7 +30,8 @@ from solar_cli.settings.local import CostFit, LocalMethod
 from solar_cli.streams import Streams
 
 ROLLOUTS = 20
-"""batches of a policy that are rolled out: 400 samples or more of each time step's fits"""
+"""batches of a policy that are rolled out: a time step's fits have so many times the samples of an
+iteration's episodes with noise"""
 OWN_STEP = 1e-3  # reach of a cost's fit in time steps: neighbours weigh nothing
 VARIANCE = 1e-8  # of q(z | s) around a position, in units of its variance
 

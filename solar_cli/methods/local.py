@@ -228,7 +228,8 @@ class LocalLearner(ABC):
 
     def checked(self, states: Trajectories, older: list[Trajectories]) -> dict[str, float]:
         """Whether the task shows the last action, and whether episodes are held somewhere."""
-        return task_metrics(states, older, self.latent, self.task.action_cost)
+        task = self.task
+        return task_metrics(states, older, self.latent, task.action_cost, task.action.bound)
 
     def adopt(
         self,

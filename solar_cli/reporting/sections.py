@@ -100,7 +100,10 @@ def _comparison(problem: Problem) -> Table | None:
 
 
 def exhibit(curve: Curve, artifacts: Artifacts) -> Exhibit | None:
-    """Pictures of the seed in the middle of the final values, never of the best one."""
+    """Pictures of the seed in the middle of the final values, never of the best one.
+
+    Where a model sees a state, of the policy alone; None where there is nothing to show.
+    """
     having = [
         seed
         for seed in _by_final_value(curve)
@@ -110,11 +113,12 @@ def exhibit(curve: Curve, artifacts: Artifacts) -> Exhibit | None:
         return None
     record = having[(len(having) - 1) // 2].record
     settings = record.cell.configuration.task
-    if settings.observation.kind != "image":
-        return None
+    of_model = settings.observation.kind == "image"
     damage: list[str] = []
 
     def drawn(kind: str) -> bytes | None:
+        if kind != "animation" and not of_model:
+            return None
         try:
             return _draw(settings, kind, artifacts.get((record.hash, kind)))
         except SolarError as error:
@@ -122,6 +126,8 @@ def exhibit(curve: Curve, artifacts: Artifacts) -> Exhibit | None:
             return None
 
     pictures = {kind: drawn(kind) for kind in PICTURES}
+    if not damage and not any(pictures.values()):
+        return None
     return Exhibit(curve.label, record.cell.seed, **pictures, damage=tuple(damage))
 
 
@@ -131,7 +137,9 @@ def _draw(settings: TaskSettings, kind: str, artifact: ArtifactRecord | None) ->
     stored = arrays(artifact)
     try:
         if kind == "animation":
-            return animation(settings, stored["frames"])
+            frames = stored["frames"]
+            # Of a task seen as a state, older versions stored states: (K, T+1, S).
+            return animation(settings, frames) if frames.ndim == 5 else None
         if kind == "reconstruction":
             return reconstructions(settings, stored["original"], stored["reconstruction"])
         space = latent_space(stored["latents"], stored["truth"], stored["names"].tolist())

@@ -83,7 +83,9 @@ class Training(Settings):
     steps: int = setting(2000, "gradient steps of the first training", ge=1)
     fine_tune_steps: int = setting(0, "gradient steps in later iterations; 0 freezes e(s)", ge=0)
     fine_tune_rate: float = setting(3e-4, "Adam, in later iterations", gt=0)
-    buffer: int = setting(3, "B: batches that later trainings draw from", "Alg. 1", ge=1)
+    buffer: int = setting(
+        3, "B: iterations whose batches later trainings draw from", "Alg. 1", ge=1
+    )
     segments: int = setting(10, "segments of consecutive frames a step", ge=1)
     length: int = setting(12, "frames of a segment", ge=2)
     decoded: float = setting(0.5, "share of a step's frames that are decoded", gt=0, le=1)
@@ -120,7 +122,7 @@ class LocalFit(Settings):
     older_counts: tuple[float, ...] = setting(
         (0.0, 10.0), "pseudo-counts of older batches, chosen by held-out likelihood", min_length=1
     )
-    older_batches: int = setting(3, "older batches that may be used", ge=0)
+    older_batches: int = setting(3, "earlier iterations whose batches may be used", ge=0)
     folds: int = setting(3, "folds of the held-out likelihood", ge=2)
     ridge: float = setting(
         0.003, "noise of a latent, in units of its std, that slopes must bear", gt=0

@@ -1,5 +1,7 @@
 """Checks of a task against regressions in NumPy, delayed systems, and the car at its wall."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -13,6 +15,8 @@ from solar_cli.envs.car import STEERING, TARGET, WALL, Car
 from solar_cli.models.basis import LatentBasis
 
 ACTION_COST = 0.001
+FREE = math.inf
+"""bound of actions that nothing clips"""
 
 
 def trajectories(z, actions, means=None, costs=None, lengths=None) -> Trajectories:
@@ -43,18 +47,24 @@ def moved_by(actions, delay, noise, rng):
 # The last action
 
 
+@pytest.mark.parametrize("bound", [FREE, 2.0])
 @pytest.mark.parametrize(("d", "a"), [(1, 2), (2, 1)])
-def test_the_p_value_is_that_of_nested_regressions(d, a):
-    """With a dummy for each time step of each batch; of episodes that end early, live steps."""
+def test_the_p_value_is_that_of_nested_regressions(d, a, bound):
+    """With a dummy for each time step of each batch; of episodes that end early, live steps.
+
+    Without those that one of the last four actions led to at its bound.
+    """
     rng = np.random.default_rng(0)
     batches, rows = [], []
     for number in range(2):
         lengths = np.array([7, 4, 7, 2, 6, 7, 5, 7, 3])
-        z, actions = rng.normal(size=(9, 8, 3)), rng.normal(size=(9, 7, a))
+        z, actions = rng.normal(size=(9, 8, 3)), rng.normal(size=(9, 7, a)).clip(-bound, bound)
         means = rng.normal(size=actions.shape)
         z[:, 1:, :d] += 0.4 * (actions - means)[..., :1]
         batches.append(trajectories(z, actions, means, lengths=lengths))
         for n, t in np.argwhere(np.arange(7) < lengths[:, None]):
+            if np.abs(actions[n, max(t - 3, 0) : t + 1]).max() == bound:
+                continue
             noise = [(actions - means)[n, t - k] if t >= k else np.zeros(a) for k in range(4)]
             step = np.eye(14)[7 * number + t]
             rows.append((z[n, t + 1, :d] - z[n, t, :d], noise[0], [*z[n, t], *step, *noise[1:]]))
@@ -66,11 +76,11 @@ def test_the_p_value_is_that_of_nested_regressions(d, a):
         return residual.T @ residual
 
     whole = np.hstack([others, last])
-    fewer, more, free = errors(others), errors(whole), len(y) - whole.shape[1]
+    fewer, more, free = errors(others), errors(whole), len(y) - np.linalg.matrix_rank(whole)
     wilks = np.linalg.det(more) / np.linalg.det(fewer)  # exact where d or a is 1
     expected = stats.f.sf((1 / wilks - 1) * (free - d + 1) / (d * a), d * a, free - d + 1)
-    assert 1e-20 < expected < 0.1
-    assert last_action(batches, d)[0] == pytest.approx(expected, rel=1e-5)
+    assert 1e-20 < expected < 0.5
+    assert last_action(batches, d, bound)[0] == pytest.approx(expected, rel=1e-5)
 
 
 def test_without_an_effect_p_values_are_uniform():
@@ -78,7 +88,7 @@ def test_without_an_effect_p_values_are_uniform():
     found = []
     for _ in range(300):
         z, actions = rng.normal(size=(6, 13, 4)), rng.normal(size=(6, 12, 2))
-        p_value, late = last_action([trajectories(z, actions)], 2)
+        p_value, late = last_action([trajectories(z, actions)], 2, FREE)
         found.append(p_value)
         assert not late
     assert stats.kstest(found, "uniform").pvalue > 0.01
@@ -91,9 +101,39 @@ def test_an_action_that_is_seen_late_is_found_however_noisy_latents_are(delay, n
     rng = np.random.default_rng(2)
     actions = rng.normal(size=(200, 50, 2))
     z = states(moved_by(actions, delay, noise, rng), 1)
-    p_value, late = last_action([trajectories(z, actions)], 2)
+    p_value, late = last_action([trajectories(z, actions)], 2, FREE)
     assert late == (delay > 0)
     assert (p_value < 1e-9) == (delay == 0)
+
+
+def held_in_place(delay, bound, rng, episodes=100, horizon=50):
+    """Positions that feedback holds at zero, in episodes whose actions are clipped."""
+    places, late = 1.5 * rng.normal(size=(episodes, 2)), np.zeros((delay + 1, episodes, 2))
+    seen, actions, means = [], [], []
+    for _ in range(horizon):
+        seen.append(places + 0.1 * rng.normal(size=places.shape))
+        means.append(-seen[-1])
+        actions.append((means[-1] + 0.7 * rng.normal(size=places.shape)).clip(-bound, bound))
+        late = np.concatenate([actions[-1:], late[:-1]])
+        places = places + 0.3 * late[-1]
+    seen.append(places + 0.1 * rng.normal(size=places.shape))
+    return trajectories(*(np.stack(part, axis=1) for part in (seen, actions, means)))
+
+
+def test_actions_that_are_clipped_hide_no_delay():
+    """What is left of the noise of a clipped action tells where the state was, not what it did."""
+    for seed in range(5):
+        shown, late = (held_in_place(k, 1.0, np.random.default_rng(seed)) for k in (0, 1))
+        assert 0.2 < float((late.actions.abs() == 1.0).double().mean()) < 0.25
+        assert last_action([late], 2, 1.0)[1]
+        p_value, found = last_action([shown], 2, 1.0)
+        assert p_value < 1e-9
+        assert not found
+
+
+def test_where_nearly_all_actions_are_clipped_nothing_is_said():
+    held = held_in_place(1, 0.01, np.random.default_rng(0))
+    assert last_action([held], 2, 0.01) == (1.0, False)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01, 0.2])
@@ -104,7 +144,7 @@ def test_a_hidden_velocity_does_not_make_an_action_late(noise):
         actions = rng.normal(size=(100, 50, 2))
         velocity = 0.1 * actions.cumsum(axis=1)
         z = states(moved_by(0.1 * velocity, 0, noise, rng), 4)
-        assert not last_action([trajectories(z, actions)], 2)[1]
+        assert not last_action([trajectories(z, actions)], 2, FREE)[1]
 
 
 def test_noise_that_is_smooth_in_time_does_not_make_an_action_late():
@@ -114,7 +154,7 @@ def test_noise_that_is_smooth_in_time_does_not_make_an_action_late():
         actions = smooth_noise((200, 50, 2), 2.0, rng)
         velocity = 0.1 * actions.cumsum(axis=1)
         z = states(moved_by(0.1 * velocity, 0, 0.1, rng), 4)
-        assert not last_action([trajectories(z, actions)], 2)[1]
+        assert not last_action([trajectories(z, actions)], 2, FREE)[1]
 
 
 class ExplicitCar(Car):
@@ -137,7 +177,7 @@ def test_a_car_by_explicit_euler_shows_its_actions_late(car, expected):
         truth.append(simulator.truth(rows))
     seen = np.stack(truth, axis=1)
     z = states(seen + 0.01 * rng.normal(size=seen.shape), 4)
-    assert last_action([trajectories(z, actions)], 4)[1] == expected
+    assert last_action([trajectories(z, actions)], 4, FREE)[1] == expected
 
 
 def test_older_batches_and_only_episodes_with_noise_tell():
@@ -146,10 +186,10 @@ def test_older_batches_and_only_episodes_with_noise_tell():
     z = states(moved_by(actions, 1, 1.0, rng), 1)
     newest, older = (trajectories(z[rows], actions[rows]) for rows in (slice(10), slice(10, 60)))
     quiet = trajectories(z[10:], actions[10:], actions[10:])
-    assert not last_action([newest], 2)[1]
-    assert last_action([newest, older], 2)[1]
-    assert last_action([newest, quiet], 2) == last_action([newest], 2)
-    assert last_action([quiet], 2) == (1.0, False)
+    assert not last_action([newest], 2, FREE)[1]
+    assert last_action([newest, older], 2, FREE)[1]
+    assert last_action([newest, quiet], 2, FREE) == last_action([newest], 2, FREE)
+    assert last_action([quiet], 2, FREE) == (1.0, False)
 
 
 def test_latents_that_do_not_move_or_are_far_out_are_no_reason_to_stop():
@@ -157,7 +197,7 @@ def test_latents_that_do_not_move_or_are_far_out_are_no_reason_to_stop():
     actions = rng.normal(size=(20, 20, 2))
     for scale in (0.0, 1e-12, 1e12):
         z = scale * moved_by(actions, 0, 0.1, rng) @ np.ones((2, 3))  # of rank 1, too
-        assert np.isfinite(last_action([trajectories(z, actions)], 3)[0])
+        assert np.isfinite(last_action([trajectories(z, actions)], 3, FREE)[0])
 
 
 def test_some_of_very_many_transitions_are_enough(monkeypatch):
@@ -165,16 +205,18 @@ def test_some_of_very_many_transitions_are_enough(monkeypatch):
     actions = rng.normal(size=(200, 50, 2))
     for delay in (0, 1):
         batch = trajectories(states(moved_by(actions, delay, 1.0, rng), 1), actions)
-        whole = last_action([batch], 2)
+        whole = last_action([batch], 2, FREE)
         monkeypatch.setattr(task_checks, "JUDGED", 3000)  # of 10000
-        some = last_action([batch], 2)
+        some = last_action([batch], 2, FREE)
         monkeypatch.undo()
         assert (whole[1], some[1]) == (delay == 1, delay == 1)
         assert delay == 0 or some[0] != whole[0]  # p is zero without a delay
     # Without an effect, p values stay uniform.
     monkeypatch.setattr(task_checks, "JUDGED", 30)
     found = [
-        last_action([trajectories(rng.normal(size=(8, 13, 2)), rng.normal(size=(8, 12, 1)))], 1)[0]
+        last_action(
+            [trajectories(rng.normal(size=(8, 13, 2)), rng.normal(size=(8, 12, 1)))], 1, FREE
+        )[0]
         for _ in range(300)
     ]
     assert stats.kstest(found, "uniform").pvalue > 0.01
@@ -218,10 +260,10 @@ def test_a_car_at_the_wall_behind_its_target_is_stuck_and_one_that_stops_is_not(
 
 def test_metrics_are_those_of_the_newest_batch_and_of_all():
     at_wall, stopped = drive(NEVER, 1.0)[0], drive(TARGET[0], 1.0)[0]
-    found = task_metrics(at_wall, [stopped], 4, ACTION_COST)
-    assert found["last_action_p_value"] == last_action([at_wall, stopped], 4)[0]
+    found = task_metrics(at_wall, [stopped], 4, ACTION_COST, 3.0)
+    assert found["last_action_p_value"] == last_action([at_wall, stopped], 4, 3.0)[0]
     assert (found["action_seen_late"], found["stuck"]) == (0.0, 1.0)
-    assert task_metrics(stopped, [at_wall], 4, ACTION_COST)["stuck"] == 0.0
+    assert task_metrics(stopped, [at_wall], 4, ACTION_COST, 3.0)["stuck"] == 0.0
 
 
 def test_without_noise_or_before_the_end_nobody_knows():

@@ -2,12 +2,11 @@
 
 from functools import cache
 
+import gymnasium
 import pytest
 
 from solar_cli.envs.offscreen import load_mujoco, make_renderer
 from solar_cli.errors import UsageError
-
-DRAWN_BY_MUJOCO = {"reacher"}
 
 
 @cache
@@ -20,6 +19,14 @@ def lacking():
     return ""
 
 
+def mujoco_draws(settings):
+    """Whether a picture of this task is MuJoCo's, for a learner or for people."""
+    if settings.simulator == "gymnasium":
+        return "mujoco" in str(gymnasium.spec(settings.parameters["id"]).entry_point)
+    return settings.simulator == "reacher" or settings.parameters.get("backend") == "mujoco"
+
+
 def skip_if_it_cannot_be_drawn(settings):
-    if settings.simulator in DRAWN_BY_MUJOCO and lacking():
+    """Where a learner sees pictures."""
+    if settings.observation.kind == "image" and mujoco_draws(settings) and lacking():
         pytest.skip(lacking())

@@ -1,8 +1,13 @@
 """Gymnasium environments through a card: what they do is what the task does, or one clear line."""
 
+import os
+import subprocess
+import sys
+
 import gymnasium
 import numpy as np
 import pytest
+from drawing import lacking
 from gymnasium import spaces
 
 from solar_cli.envs import build_task, drawable, picture
@@ -10,6 +15,8 @@ from solar_cli.envs.gymnasium_task import Camera
 from solar_cli.episodes import roll_out
 from solar_cli.errors import SolarError, UsageError
 from solar_cli.settings import Observation, TaskSettings, load_card
+
+mujoco_draws_here = pytest.mark.skipif(bool(lacking()), reason=lacking() or "it can be drawn")
 
 LOW, HIGH = np.array([-1.0, 0.0], np.float32), np.array([3.0, 0.5], np.float32)
 
@@ -347,6 +354,45 @@ def test_a_state_that_nothing_renders_is_not_drawn(name, why):
         drawable(card(f"Test/{name}-v0"))
 
 
+@pytest.mark.parametrize("gl", ["egl", "disabled"])
+def test_states_need_no_graphics_library_and_pictures_say_that_they_do(gl):
+    """In a process that finds none: MuJoCo's module of it fails as it does where it is missing."""
+    program = (
+        "import sys\n"
+        "import numpy as np\n"
+        "from solar_cli.envs import build_task, drawable\n"
+        "from solar_cli.errors import UsageError\n"
+        "from solar_cli.settings import load_card\n"
+        "class Missing:\n"
+        "    def find_spec(self, name, *_):\n"
+        "        if name == 'mujoco.egl':\n"
+        "            raise AttributeError('no eglQueryString')\n"
+        "sys.meta_path.insert(0, Missing())\n"
+        "settings = load_card('pusher').task\n"
+        "task = build_task(settings)\n"
+        "task.reset([np.random.default_rng(0)])\n"
+        "print(np.isfinite(task.step(np.zeros((1, 7)))[0]).all())\n"
+        "for seen in (settings, load_card('inverted-pendulum').task):\n"
+        "    try:\n"
+        "        build_task(drawable(seen))\n"
+        "    except UsageError as error:\n"
+        "        print(error)\n"
+    )
+    shown = subprocess.run(
+        [sys.executable, "-c", program],
+        env={**os.environ, "MUJOCO_GL": gl},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    stepped, *refused = shown.stdout.splitlines()
+    assert stepped == "True"
+    assert len(refused) == 2
+    assert all(line.startswith(f"MuJoCo cannot draw here, MUJOCO_GL is {gl}") for line in refused)
+    assert shown.stderr == ""
+
+
+@mujoco_draws_here
 def test_an_image_is_what_the_environment_renders():
     make = load_card("inverted-pendulum").task.parameters["make"]
     settings, moves = pendulum(**make), Sure(np.full((3, 1), 0.5))
@@ -360,6 +406,7 @@ def test_an_image_is_what_the_environment_renders():
     env.close()
 
 
+@mujoco_draws_here
 def test_what_mujoco_draws_does_not_depend_on_what_was_drawn_before():
     """Two tasks draw in turn, from where they look by default, and one is gone in between."""
     settings = pendulum()
@@ -437,6 +484,7 @@ def test_a_step_that_fails_says_where_and_why():
         rolled(settings, np.full((6, 2), -1.5))
 
 
+@mujoco_draws_here
 def test_graphics_that_are_missing_are_told_with_what_to_install(monkeypatch):
     settings = load_card("inverted-pendulum").task
 

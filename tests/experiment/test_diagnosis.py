@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from collected_episodes import collected_in
 from predicted_costs import r2
 
 from solar_cli.control import quadratic_cost
@@ -156,7 +157,7 @@ def test_dynamics_are_plain_regression_on_the_observers_rollouts(
         np.testing.assert_allclose(dynamics.F[t].numpy(), slopes[:, :-1], rtol=1e-6, atol=1e-8)
         np.testing.assert_allclose(dynamics.f[t].numpy(), slopes[:, -1], rtol=1e-6, atol=1e-8)
     batch, older = run.learner.embedded(
-        [run.environment.collected(2)], [[run.environment.collected(1)]]
+        [collected_in(2, run.environment)], [[collected_in(1, run.environment)]]
     )
     own = local.LocalLearner.fitted_cost(run.learner, batch, older).model
     assert torch.equal(cost.C, own.C)  # of the counted batch
@@ -171,8 +172,8 @@ def test_the_cost_is_fitted_on_the_observers_rollouts(
     settings = CostFit(width=privileged.OWN_STEP, terminal=3.0)
     again = quadratic_cost.fit_quadratic_cost(rollouts, [], 0.001, settings, 4).model
     assert torch.equal(cost.C, again.C)
-    older = [run.environment.collected(1)]
-    batches = [run.environment.collected(2), older[0]]
+    older = [collected_in(1, run.environment)]
+    batches = [collected_in(2, run.environment), older[0]]
     states = [run.learner.embedded([batch], [])[0] for batch in batches]
     own = local.LocalLearner.infer_dynamics(
         run.learner, states[0], states[1:], run.learner.latent_prior([older]), run.streams
@@ -223,10 +224,10 @@ def test_with_the_true_state_no_network_sees_a_frame(
     with pytest.raises(AssertionError):
         Watched(tmp_path, monkeypatch, small()).iterate(1)
     run = Watched(tmp_path, monkeypatch, small(), Part.STATE).iterate(2)
-    frames = run.environment.collected(2).frames
+    frames = collected_in(2, run.environment).frames
     assert frames.shape == (6, 7, 4)
     moved = np.diff(frames[..., :2], axis=1)
-    np.testing.assert_allclose(moved, run.environment.collected(2).actions, atol=1e-6)
+    np.testing.assert_allclose(moved, collected_in(2, run.environment).actions, atol=1e-6)
     assert run.observed == []
 
 
@@ -235,7 +236,7 @@ def test_the_true_state_is_whitened_and_holds_velocities(
 ) -> None:
     cell = small("solar", "task.observation.window=2")
     run = Watched(tmp_path, monkeypatch, cell, Part.STATE).iterate(1)
-    batch = run.environment.collected(1)
+    batch = collected_in(1, run.environment)
     z = run.learner.representation.embed(batch).numpy()
     assert z.shape == (8, 7, 8)
     np.testing.assert_allclose(np.cov(z[..., :4].reshape(-1, 4).T), np.eye(4), atol=1e-6)
@@ -291,7 +292,7 @@ def test_rollouts_of_episodes_that_end_early_are_of_the_steps_that_are_planned_f
     assert {int(length) for batch in run.observed for length in batch.lengths} == {2, 3, 4, 5, 6}
     planned = []
     for iteration, (previous, dynamics, cost, *_) in enumerate(run.updates, start=1):
-        lengths = np.sort(run.environment.collected(iteration).lengths)
+        lengths = np.sort(collected_in(iteration, run.environment).lengths)
         planned.append(int(lengths[-2]))
         assert len(previous.k) == len(dynamics.F) == planned[-1]
         assert len(cost.C) == planned[-1] + 1
@@ -307,7 +308,9 @@ def test_what_is_rolled_out_is_the_policy_that_collected_though_training_went_on
     world = World(run.world.task, run.task, run.streams.under("environment"))
     for iteration, count in ((1, 8), (2, 6), (3, 6)):
         again = world.roll_out(run.learner._tried[iteration], count, iteration, 0)
-        np.testing.assert_array_equal(again.actions, run.environment.collected(iteration).actions)
+        np.testing.assert_array_equal(
+            again.actions, collected_in(iteration, run.environment).actions
+        )
 
 
 def test_rollouts_are_of_the_batch_that_is_built_upon(

@@ -10,6 +10,7 @@ import fake_method
 import numpy as np
 import pytest
 from bits import OF_THE_MACHINE, files_of, fingerprint, metric_digest, state_digest
+from collected_episodes import collected_in
 
 from solar_cli.envs.task import RowTask
 from solar_cli.episodes import Environment
@@ -386,7 +387,7 @@ def test_the_first_checkpoint_at_each_milestone_of_the_card_is_kept(
 def test_evaluation_episodes_are_none_that_were_learned_from(store: Store, cell: Cell) -> None:
     made = attempt(store, cell, every=1e9)
     judge, policy = Judge(cell), made.learner.policy
-    collected = [made.environment.collected(iteration)[0] for iteration in (1, 2)]
+    collected = [collected_in(iteration, made.environment)[0] for iteration in (1, 2)]
     judged = [judge.evaluate(policy, iteration).episodes for iteration in (0, 1, 2)]
     starts = [episodes.frames[i, 0].tobytes() for episodes in (*collected, *judged) for i in (0, 1)]
     assert len(set(starts)) == len(starts)

@@ -107,6 +107,21 @@ def test_a_hanging_worker_without_supervisor_ends_too() -> None:
     assert hanging.wait(timeout=250) == 1
 
 
+def test_a_worker_rounds_no_convolution_and_repeats_itself() -> None:
+    """As `tests/methods/test_devices.py` has torch, too; in a process of its own, once."""
+    program = (
+        "import torch\n"
+        "from solar_cli.experiment.worker import prepare_torch\n"
+        "assert torch.backends.cudnn.allow_tf32\n"
+        "print(prepare_torch('cpu'), torch.backends.cudnn.allow_tf32,\n"
+        "      torch.are_deterministic_algorithms_enabled(), torch.get_num_threads())"
+    )
+    shown = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert shown.stdout.split() == ["cpu", "False", "True", "1"]
+
+
 def test_sigterm_asks_a_worker_to_stop(ends: tuple[int, Pipe]) -> None:
     _, pipe = ends
     assert not pipe.stopping

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from collected_episodes import collected_in
 
 from solar_cli.envs import build_task
 from solar_cli.episodes import Environment, Experience
@@ -37,7 +38,7 @@ def learned(task: str, device: str, folder: Path) -> tuple[dict[str, float], np.
     )
     environment.begin(1)
     metrics = learner.iterate(Experience(environment))
-    latents = learner.encode(environment.collected(1))
+    latents = learner.encode(collected_in(1, environment))
     return metrics, latents / latents.std()
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from bits import digest
+from collected_episodes import collected_in
 from method_runs import Run
 
 from solar_cli.methods import solar
@@ -45,7 +46,7 @@ def run(folder, name, rubbish=0, *sets):
 @both
 def test_episodes_end_early_and_learning_goes_on(tmp_path, name):
     done = run(tmp_path, name)
-    lengths = np.concatenate([done.environment.collected(i).lengths for i in (1, 2, 3)])
+    lengths = np.concatenate([collected_in(i, done.environment).lengths for i in (1, 2, 3)])
     assert set(lengths.tolist()) == {2, 3, 4, 5, 6}
     assert all(np.isfinite(list(metrics.values())).all() for metrics in done.metrics)
     assert all(bool(torch.isfinite(part).all()) for part in done.learner.gains)
@@ -72,7 +73,7 @@ def test_an_update_is_planned_for_what_was_lived(tmp_path, monkeypatch):
     done = run(tmp_path, "solar")
     for iteration, ((previous, dynamics, _, bound, _), update) in enumerate(plans, start=1):
         region = done.learner.trust_region
-        lengths = done.environment.collected(iteration).lengths
+        lengths = collected_in(iteration, done.environment).lengths
         steps = int(np.sort(lengths)[-2])
         assert len(previous.k) == len(dynamics.f) == len(update.policy.k) == steps
         assert bound <= 0.5 * steps * region.step.high
@@ -83,10 +84,38 @@ def test_an_update_is_planned_for_what_was_lived(tmp_path, monkeypatch):
         assert all(torch.equal(later, known[reached - 1]) for later in part[reached:])
 
 
+@both
+def test_the_best_that_collects_again_goes_on_from_what_was_reached(tmp_path, name):
+    """On latents that have moved since it first acted, so that its gains are fitted anew."""
+    sets = ("training.fine_tune_steps=4", "batches={ initial = 8, noisy = 5, noise_free = 3 }")
+    done = Run(
+        tmp_path,
+        name,
+        *sets,
+        wrap=lambda task: Ending(task, 0),
+        costs=lambda iteration, costs: costs + {2: -1.0, 3: 1e3}.get(iteration, 0.0),
+    )
+    collect, tried = done.environment.collect, []
+    done.environment.collect = lambda policy, *rest, **more: (
+        tried.append(policy.gains) or collect(policy, *rest, **more)
+    )
+    done.iterate(1, 3)
+    assert [metrics["rejected"] for metrics in done.metrics] == [0.0, 0.0, 1.0]
+    best, again = tried[2], tried[-1]
+    lengths = collected_in(2, done.environment).lengths
+    reached = int(np.sort(lengths)[len(lengths) // 2])
+    assert 1 < reached < 6
+    assert len(again.k) == len(best.k) == 6
+    assert not torch.equal(again.K[reached - 1], best.K[reached - 1])
+    assert not torch.equal(again.K[reached - 2], again.K[reached - 1])
+    for part in again:
+        assert all(torch.equal(later, part[reached - 1]) for later in part[reached:])
+
+
 def test_what_steps_after_the_end_cost_counts_for_the_policy(tmp_path):
     done = run(tmp_path, "solar")
     best = done.learner.trust_region.best
-    episodes = done.environment.collected(best.iteration)
+    episodes = collected_in(best.iteration, done.environment)
     lived = np.where(episodes.live_steps, episodes.costs, 0.0).sum(axis=1)
     expected = (lived + 3.0 * (episodes.horizon - episodes.lengths)).mean()
     assert best.cost == pytest.approx(expected, rel=1e-12)

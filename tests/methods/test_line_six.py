@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from collected_episodes import collected_in
 from method_runs import Run
 
 from solar_cli.episodes import Batch, Experience, window_indices
@@ -83,7 +84,7 @@ def test_fine_tuning_preserves_the_acting_policy(tmp_path, monkeypatch):
             patch.setattr(solar, "improve_policy", lambda *a: improved.append(a[0]) or improve(*a))  # noqa: B023
             run.iterate(3, 3)
         assert run.learner.representation.moved_in == 3
-        episodes = run.environment.collected(run.learner.trust_region.current.iteration)
+        episodes = collected_in(run.learner.trust_region.current.iteration, run.environment)
         run.learner.handed = improved[0]
         errors[linearise] = change(run, episodes)
     # What is left is what no linear policy on the new latents does: the change is not affine.
@@ -121,7 +122,7 @@ def test_going_back_to_a_policy_of_older_latents_preserves_it(tmp_path, monkeypa
     assert run.metrics[2]["rejected"] == run.metrics[2]["fine_tuning_taken_back"] == 1.0
     assert run.learner.trust_region.current.iteration == 2
     run.learner.gains = improved[0]
-    assert change(run, run.environment.collected(2)) < 0.2
+    assert change(run, collected_in(2, run.environment)) < 0.2
 
 
 def test_the_best_policy_collects_again_on_the_latents_of_now(tmp_path):

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from collected_episodes import collected_in
 from method_runs import Run
 
 from solar_cli.control import trust_region
@@ -54,7 +55,7 @@ def test_an_update_that_promises_little_is_tried_before_it_is_handed_over(
         assert torch.equal(handed, part)
     run.environment.begin(3)
     run.learner.collect_and_judge(Experience(run.environment))
-    z, _ = run.learner.embedded([run.environment.collected(3)], [])
+    z, _ = run.learner.embedded([collected_in(3, run.environment)], [])
     means = torch.einsum("tij,ntj->nti", newest.K, z.z[:, :-1]) + newest.k
     torch.testing.assert_close(z.action_means, means)  # the newest is what is tried
 
@@ -76,7 +77,7 @@ def test_noise_alone_is_no_promise_of_what_has_none(tmp_path, monkeypatch, name)
 @both
 def test_batches_are_those_of_the_card(tmp_path, name):
     run = Run(tmp_path, name, "batches={ initial = 7, noisy = 5 }").iterate(1, 3)
-    assert [len(run.environment.collected(i)) for i in (1, 2, 3)] == [7, 5, 5]
+    assert [len(collected_in(i, run.environment)) for i in (1, 2, 3)] == [7, 5, 5]
     assert run.environment.episodes == 17
 
 
@@ -84,7 +85,7 @@ def test_the_first_batch_is_white_noise_of_the_cards_std(tmp_path):
     run = Run(tmp_path, "solar", "batches={ initial = 200, noisy = 4 }")
     run.environment.begin(1)
     run.learner.collect_and_judge(Experience(run.environment))
-    first = run.environment.collected(1)
+    first = collected_in(1, run.environment)
     assert not first.action_means.any()
     std = run.configuration.task.exploration.std
     count = first.actions.size
@@ -94,7 +95,7 @@ def test_the_first_batch_is_white_noise_of_the_cards_std(tmp_path):
 def test_a_noise_free_batch_judges_the_policy(tmp_path):
     run = Run(tmp_path, "solar", "batches={ initial = 8, noisy = 4, noise_free = 3 }").iterate(1, 2)
     for iteration, noisy in ((1, 8), (2, 4)):
-        episodes = run.environment.collected(iteration)
+        episodes = collected_in(iteration, run.environment)
         assert len(episodes) == noisy + 3
         quiet, loud = episodes[:3], episodes[3:]
         np.testing.assert_array_equal(quiet.actions, quiet.action_means)
@@ -116,7 +117,7 @@ def test_a_rejected_batch_goes_back_to_the_best_policy_and_its_data(tmp_path, mo
     assert metrics["actual_improvement"] < -1e3
     assert region.best.iteration == region.current.iteration == 1
     assert metrics["step_multiplier"] < run.metrics[0]["step_multiplier"]
-    first, second = (run.environment.collected(i) for i in (1, 2))
+    first, second = (collected_in(i, run.environment) for i in (1, 2))
     newest, older = dynamics[1][:2]
     np.testing.assert_array_equal(newest.costs, first.costs)
     np.testing.assert_array_equal(older[0].costs, second.costs)
@@ -125,7 +126,7 @@ def test_a_rejected_batch_goes_back_to_the_best_policy_and_its_data(tmp_path, mo
     run.iterate(3, 3)
     assert run.metrics[2]["rejected"] == 0.0
     assert run.learner.trust_region.current.iteration == 3
-    np.testing.assert_array_equal(dynamics[2][0].costs, run.environment.collected(3).costs)
+    np.testing.assert_array_equal(dynamics[2][0].costs, collected_in(3, run.environment).costs)
 
 
 def test_where_episodes_without_noise_reject_a_policy_the_best_collects_again(
@@ -171,7 +172,7 @@ def test_without_rejection_the_newest_batch_is_built_upon(tmp_path):
 def test_older_batches_are_the_last_ones_newest_first(tmp_path, monkeypatch):
     dynamics = spied(monkeypatch, "infer_dynamics")
     run = Run(tmp_path, "solar", "local_fit.older_batches=2", 'update.reject="never"').iterate(1, 4)
-    costs = {i: run.environment.collected(i).costs for i in (1, 2, 3, 4)}
+    costs = {i: collected_in(i, run.environment).costs for i in (1, 2, 3, 4)}
     for iteration, expected in enumerate([[], [1], [2, 1], [3, 2]], 1):
         newest, older = dynamics[iteration - 1][:2]
         np.testing.assert_array_equal(newest.costs, costs[iteration])
@@ -253,7 +254,7 @@ def test_only_solar_has_a_factor_over_dynamics(tmp_path):
     vae_run = Run(tmp_path / "vae", "vae").iterate(1, 1)
     for run, known in ((solar_run, True), (vae_run, False)):
         for own in (True, False):
-            older = [run.environment.collected(1)]
+            older = [collected_in(1, run.environment)]
             prior = run.learner.representation.dynamics_prior(older, as_it_stands=own)
             assert (prior.factor is not None) == known
     assert "kl_dynamics" in solar_run.metrics[0]
@@ -295,10 +296,12 @@ def test_checks_of_the_task_are_stored_and_change_nothing(tmp_path, monkeypatch,
 def test_what_is_built_upon_and_older_batches_are_checked(tmp_path, monkeypatch):
     calls = spied(monkeypatch, "task_metrics")
     run = Run(tmp_path, "solar", costs=of_iteration(2, lambda costs: costs + 1e3)).iterate(1, 2)
-    newest, older, latent, action_cost = calls[1]
-    np.testing.assert_array_equal(newest.costs, run.environment.collected(1).costs)  # 2 is rejected
-    np.testing.assert_array_equal(older[0].costs, run.environment.collected(2).costs)
-    assert (latent, action_cost) == (4, run.configuration.task.action_cost)
+    newest, older, *rest = calls[1]
+    first, rejected = (collected_in(i, run.environment) for i in (1, 2))
+    np.testing.assert_array_equal(newest.costs, first.costs)
+    np.testing.assert_array_equal(older[0].costs, rejected.costs)
+    task = run.configuration.task
+    assert rest == [4, task.action_cost, task.action.bound]
 
 
 # Diagnosing
@@ -324,7 +327,7 @@ def test_diagnosis_is_of_the_newest_latents(tmp_path, monkeypatch):
 
 def test_without_truth_there_is_no_diagnosis(tmp_path):
     run = Run(tmp_path, "solar").iterate(1, 1)
-    episodes = run.environment.collected(1)
+    episodes = collected_in(1, run.environment)
     blind = Evaluation(episodes, {}, np.empty((len(episodes), 7, 0)))
     assert run.learner.diagnose(blind) == {}
 
@@ -332,7 +335,7 @@ def test_without_truth_there_is_no_diagnosis(tmp_path):
 @both
 def test_a_trained_method_shows_what_it_sees(tmp_path, name):
     run = Run(tmp_path, name).iterate(1, 1)
-    episodes = run.environment.collected(1)
+    episodes = collected_in(1, run.environment)
     found = run.learner.reconstruct(episodes[:2])
     assert found.shape == episodes.frames[:2].shape
     assert found.dtype == np.uint8

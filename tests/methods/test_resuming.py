@@ -41,21 +41,26 @@ def test_a_run_interrupted_at_any_pulse_ends_with_the_same_bits(tmp_path, name, 
 @pytest.mark.parametrize("name", ["solar", "vae"])
 @pytest.mark.parametrize("noise_free", [0, 2])
 def test_a_run_interrupted_while_it_collects_ends_with_the_same_bits(tmp_path, name, noise_free):
+    """With episodes that judge, the third iteration is rejected: the best collects again."""
     sets = (*FINE_TUNING, f"batches.noise_free={noise_free}")
-    last, saved = 3, []
+    last, saved, more = 3, [], {2: -1.0, 3: 1e3} if noise_free else {}
 
     steps = count(1)
+
+    def costing(iteration, costs):
+        return costs + more.get(iteration, 0.0)
 
     def halfway(iteration, costs):
         if next(steps) % 6 == 3:  # of the six steps of an episode
             saved.append((iteration, whole.state()))
-        return costs
+        return costing(iteration, costs)
 
     whole = Run(tmp_path, name, *sets, costs=halfway)
     whole.iterate(1, last)
     assert [iteration for iteration, _ in saved] == sorted([1, 2, 3] * (1 + bool(noise_free)))
+    assert [metrics["rejected"] for metrics in whole.metrics] == [0.0, 0.0, float(noise_free > 0)]
     for iteration, state in saved:
-        resumed = Run(tmp_path, name, *sets).restore(state).iterate(iteration, last)
+        resumed = Run(tmp_path, name, *sets, costs=costing).restore(state).iterate(iteration, last)
         assert repr(resumed.metrics) == repr(whole.metrics[iteration - 1 :])
         assert resumed.bits() == whole.bits()
 

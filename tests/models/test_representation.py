@@ -334,6 +334,19 @@ def test_the_same_networks_encode_no_collected_frame_twice(monkeypatch, fine_tun
     assert encoded == [3]
 
 
+def test_no_attempt_is_judged_by_the_latents_of_the_one_before():
+    """Whether what is encoded may be remembered, by the name of its batch, changes nothing."""
+    models = [make(Scores(0.0, 1.0), attempts=2) for _ in range(2)]
+    named = replace(FIRST, batch=Batch(1, 0))
+    found = [
+        without_seconds(model.update(Collected(first)))
+        for model, first in zip(models, (FIRST, named), strict=True)
+    ]
+    assert found[0]["discarded_trainings"] == 1.0
+    assert found[1] == found[0]
+    assert digest(models[1].state_dict()) == digest(models[0].state_dict())
+
+
 def test_a_frozen_encoder_keeps_its_states_and_learns_its_dynamics():
     model = make(buffer=2)
     batches = [FIRST, *(vector_episodes(TASK, 5, seed=seed) for seed in (1, 2))]

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from stored_cells import store_attempt
 
 from solar_cli.reporting.curves import Curve, Problem, SeedCurve, seed_curve
@@ -101,10 +102,11 @@ def compute(
     return store_attempt(store, of, iterations, outcome, provenance, error)
 
 
-def add_pictures(store: Store, of: Cell, attempt: int) -> None:
+def add_pictures(store: Store, of: Cell, attempt: int, frames: NDArray[Any] | None = None) -> None:
     """Three episodes of four frames each, two reconstructed frames, and twelve latents."""
     stream = np.random.default_rng(of.seed)
-    frames = stream.integers(0, 50, (3, 4, 2, 32, 32), dtype=np.uint8)
+    if frames is None:
+        frames = stream.integers(0, 50, (3, 4, 2, 32, 32), dtype=np.uint8)
     folder = store.folder(of.hash)
     folder.mkdir(parents=True, exist_ok=True)
     arrays = {

@@ -19,7 +19,7 @@ from solar_cli.reporting.animation import (
 )
 from solar_cli.reporting.curves import problems
 from solar_cli.reporting.sections import exhibit
-from solar_cli.settings import load_card
+from solar_cli.settings import cells, load_card
 from solar_cli.store.records import Outcome
 
 MOVE = np.array([[5.0, 0.0]])
@@ -142,6 +142,26 @@ def test_the_seed_that_is_shown_is_the_one_in_the_middle(tmp_path):
     assert shown.reconstruction
     assert shown.latents
     assert shown.damage == ()
+
+
+@pytest.mark.parametrize("stored", ["pictures", "states"])
+def test_of_a_state_task_the_policy_is_shown_and_nothing_of_its_model(tmp_path, stored):
+    """Older versions stored the states where newer ones store pictures: then there is nothing."""
+    [of] = cells(load_card("car-states"), "solar", [0])
+    settings, rng = of.configuration.task, np.random.default_rng(0)
+    if stored == "pictures":
+        frames = rng.integers(0, 255, (3, 4, 1, 40, 40), dtype=np.uint8)
+    else:
+        frames = rng.normal(size=(3, 4, 9)).astype(np.float32)
+    with database(tmp_path) as store:
+        add_pictures(store, of, compute(store, of, [1.0, 0.5], None), frames)
+        (problem,) = problems(store)
+        shown = exhibit(problem.curves[0], {(a.cell, a.kind): a for a in store.artifacts()})
+    if stored == "states":
+        assert shown is None
+        return
+    assert shown.animation == animation(drawable(settings, 40), frames)
+    assert (shown.reconstruction, shown.latents, shown.damage) == (None, None, ())
 
 
 def test_a_damaged_or_missing_file_is_said_and_the_rest_is_shown(tmp_path):

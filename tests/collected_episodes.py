@@ -1,0 +1,9 @@
+"""What an environment has collected."""
+
+from solar_cli.episodes import Environment, Episodes
+
+
+def collected_in(iteration: int, environment: Environment) -> Episodes:
+    """All episodes of one iteration, in order."""
+    names = [name for name in environment.batches() if name.iteration == iteration]
+    return Episodes.joined([environment.batch(name) for name in names])
