@@ -163,7 +163,10 @@ class GymnasiumEpisode:
     def _see(self, observation: Any, info: dict[str, Any]) -> None:
         self._info = info
         if self._camera is None or self._parameters.reads_entries:
-            self._observed = np.array(observation, np.float64).ravel()
+            observed = np.array(observation, np.float64).ravel()
+            if len(self._observed) not in (0, len(observed)):
+                raise ValueError(f"{len(observed)} numbers observed, {len(self._observed)} before")
+            self._observed = observed
         if self._camera is None:
             self._frame = self._observed.astype(np.float32)
         else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from typing import Any
 
@@ -15,6 +16,8 @@ from solar_cli.experiment.watched import WatchedTask
 from solar_cli.settings import Cell
 from solar_cli.store.records import Metric
 from solar_cli.streams import Streams
+
+log = logging.getLogger(__name__)
 
 DRAWN_ROWS = 160
 """of a picture of a task that is learned from its state"""
@@ -59,7 +62,8 @@ class Judge:
             streams = self._streams.under(iteration)
             resets = [streams.generator("reset", i) for i in range(len(first))]
             return roll_out(task, shown, Recorded(first.actions), resets, None).episodes.frames
-        except SolarError:  # a picture that is missing must not stop a learner
+        except SolarError as error:  # a picture that is missing must not stop a learner
+            log.warning("no animation of what was learned: %s", error)
             return None
 
 

@@ -150,13 +150,13 @@ class Supervision:
         if self._killed:
             return Outcome.INTERRUPTED, "stopped at once on request"
         if code >= 0:
-            return Outcome.FAILED, f"the worker ended with exit code {code}; its log says why"
+            return Outcome.FAILED, f"the worker ended with exit code {code}: see the end of its log"
         number = -code
         if self._asked and number == signal.SIGTERM:
             return Outcome.INTERRUPTED, "stopped on request while it started"
         name = signal.Signals(number).name if number in set(signal.Signals) else f"signal {number}"
         if number not in OUTSIDE:
-            return Outcome.FAILED, f"the worker crashed with {name}; its log says where"
+            return Outcome.FAILED, f"the worker crashed with {name}: see the end of its log"
         cause = f"the worker was ended by {name}"
         if number == signal.SIGKILL and _oom_kills() != self._oom_kills:
             cause += " while memory ran out: use fewer --workers"

@@ -28,8 +28,9 @@ class Walk(gymnasium.Env):
     observation_space = spaces.Box(-np.inf, np.inf, (2, 1))
     action_space = spaces.Box(LOW, HIGH)
 
-    def __init__(self, fails_at=None, truncates_at=None, render_mode=None):
-        self.fails_at, self.truncates_at, self.render_mode = fails_at, truncates_at, render_mode
+    def __init__(self, fails_at=None, truncates_at=None, grows_at=None, render_mode=None):
+        self.fails_at, self.truncates_at, self.grows_at = fails_at, truncates_at, grows_at
+        self.render_mode = render_mode
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -45,7 +46,8 @@ class Walk(gymnasium.Env):
         self.place = self.place + action
         told = {"effort": float(np.square(action).sum())}
         over = bool(self.place[0] > 2.0)
-        return self.place[:, None], self.place[1], over, self.steps == self.truncates_at, told
+        seen = self.place[:, None] if self.steps != self.grows_at else np.zeros((3, 1))
+        return seen, self.place[1], over, self.steps == self.truncates_at, told
 
     def render(self):
         """Twelve rows and eight columns: red says where it is, blue is the right half."""
@@ -482,6 +484,12 @@ def test_a_step_that_fails_says_where_and_why():
     cause = r"Test/Walk-v0 fails in step 4 of an episode \(RuntimeError: the floor is gone\)"
     with pytest.raises(SolarError, match=cause):
         rolled(settings, np.full((6, 2), -1.5))
+
+
+def test_an_observation_that_changes_its_size_says_where():
+    cause = r"Test/Walk-v0 fails in step 3 of an episode \(ValueError: 3 numbers observed, 2 before"
+    with pytest.raises(SolarError, match=cause):
+        rolled(card(make={"grows_at": 3}), np.full((6, 2), -1.5))
 
 
 @mujoco_draws_here
