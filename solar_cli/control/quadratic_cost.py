@@ -26,7 +26,7 @@ from solar_cli.control.trajectories import Trajectories
 from solar_cli.settings.local import CostFit
 
 LBFGS_ROUNDS = 100
-COMPARED_ROUNDS = 40  # of a fit per time step on a fold, whose R2 is a few thousandths lower
+COMPARED_ROUNDS = 40  # of a fit per time step on a fold; its R2 is lower by up to .004 (car)
 SGD_STEPS = 1000
 SGD_RATE = 1e-2
 PULL = 1e-3  # of a fit per time step towards the shared one, on standardised costs

@@ -25,7 +25,7 @@ LEAST_PROMISE = 0.2
 """Share of what has been gained so far below which an update is tried before it is handed over: of
 those that promised a twentieth to a fifth 29 of 69 made things worse, and the others gained little;
 of those that promised a fifth or more, up to all, 11 of 62, and they gained much (car, reacher and
-Sawyer)"""
+Sawyer; counted when a promise still had the noise's part in it)"""
 
 LEFT_TO_GAIN = 0.05
 """Share of what has been gained so far that an update must promise for steps to grow"""

@@ -39,7 +39,7 @@ from solar_cli.settings.local import LocalMethod
 from solar_cli.streams import Streams
 
 MOST_BATCHES = 4
-"""of the policy that is built upon, the last ones: more than these only cost time"""
+"""of the policy that is built upon, the last ones: bounds memory and time"""
 
 
 class LocalLearner(ABC):

@@ -24,7 +24,7 @@ class Solar(LocalLearner):
 
     def iterate(self, experience: Experience) -> dict[str, float]:
         """One turn of Algorithm 1 (lines 4 to 8)."""
-        region = self.collect_and_judge(experience)  # line 4: N rollouts, of the best policy
+        region = self.collect_and_judge(experience)  # line 4: of the newest, or the best
         batches, older = self.to_learn_from(experience, region)
 
         model = self.representation.update(experience)  # line 5: MODELUPDATE, section 3

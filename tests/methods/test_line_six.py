@@ -45,6 +45,20 @@ def before_the_update(tmp_path, linearise: str):
     return run, region, batch
 
 
+def best_is_the_second(tmp_path, batches: str) -> Run:
+    """Fine-tuned; the second policy gains much, the third one loses as much."""
+    costs = {2: -1e3, 3: 1e3}
+    return Run(
+        tmp_path,
+        "solar",
+        batches,
+        "training.steps=60",
+        "training.fine_tune_steps=12",
+        "training.fine_tune_rate=0.001",
+        costs=lambda iteration, cost: cost + costs.get(iteration, 0.0),
+    )
+
+
 @pytest.mark.parametrize(("linearise", "preserved"), [("true", True), ("false", False)])
 def test_a_changed_head_is_undone_by_line_six_alone(tmp_path, linearise, preserved):
     run, region, episodes = before_the_update(tmp_path, linearise)
@@ -103,17 +117,7 @@ def test_a_frozen_encoder_leaves_the_policy_as_it_is(tmp_path):
 
 def test_going_back_to_a_policy_of_older_latents_preserves_it(tmp_path, monkeypatch):
     """The best policy acted before the last fine-tuning that held; the newest is taken back."""
-    costs = {2: -1e3, 3: 1e3}
-    run = Run(
-        tmp_path,
-        "solar",
-        "batches={ initial = 32, noisy = 32 }",
-        "training.steps=60",
-        "training.fine_tune_steps=12",
-        "training.fine_tune_rate=0.001",
-        costs=lambda iteration, cost: cost + costs.get(iteration, 0.0),
-    )
-    run.iterate(1, 2)
+    run = best_is_the_second(tmp_path, "batches={ initial = 32, noisy = 32 }").iterate(1, 2)
     improved, improve = [], solar.improve_policy
     monkeypatch.setattr(solar, "improve_policy", lambda *a: improved.append(a[0]) or improve(*a))
     alive = iter([True, False])  # before the training, and after it
@@ -127,17 +131,8 @@ def test_going_back_to_a_policy_of_older_latents_preserves_it(tmp_path, monkeypa
 
 def test_the_best_policy_collects_again_on_the_latents_of_now(tmp_path):
     """It acted before the fine-tuning of its iteration; the next policy is worse."""
-    costs = {2: -1e3, 3: 1e3}
-    run = Run(
-        tmp_path,
-        "solar",
-        "batches={ initial = 32, noisy = 32, noise_free = 2 }",
-        "training.steps=60",
-        "training.fine_tune_steps=12",
-        "training.fine_tune_rate=0.001",
-        costs=lambda iteration, cost: cost + costs.get(iteration, 0.0),
-    )
-    run.iterate(1, 2)
+    batches = "batches={ initial = 32, noisy = 32, noise_free = 2 }"
+    run = best_is_the_second(tmp_path, batches).iterate(1, 2)
     assert run.learner.representation.moved_in == 2
     best, again = Batch(2, 1), Batch(3, 1)
     run.environment.begin(3)
