@@ -55,6 +55,20 @@ BUILT_IN = (
         settings="solar_cli.settings.local:Vae",
         learner="solar_cli.methods.vae:Vae",
     ),
+    MethodEntry(
+        name="zero",
+        summary="A reference: no action at all.",
+        source="reference policy",
+        settings="solar_cli.settings.reference:Reference",
+        learner="solar_cli.methods.reference:Zero",
+    ),
+    MethodEntry(
+        name="random",
+        summary="A reference: actions drawn uniformly between their bounds.",
+        source="reference policy",
+        settings="solar_cli.settings.reference:Reference",
+        learner="solar_cli.methods.reference:Random",
+    ),
 )
 
 
