@@ -44,6 +44,20 @@ def picture(settings: TaskSettings, frames: Frames, factor: int = 8) -> NDArray[
     return np.rint(255.0 * colours).astype(np.uint8)
 
 
+def state_cost(settings: TaskSettings) -> StateCost:
+    """The task's own cost of states as they are seen, for methods that may know it.
+
+    Raises `UsageError` where images are seen, or where the simulator cannot say.
+    """
+    if settings.observation.kind == "image":
+        raise UsageError("the task is seen as images, of which no cost is known")
+    simulator = _simulator(settings)
+    if not hasattr(simulator, "state_cost"):
+        raise UsageError(f"simulator {settings.simulator!r} says no cost of its states")
+    cost: StateCost = simulator.state_cost(settings)
+    return cost
+
+
 def drawable(settings: TaskSettings, rows: int = 240) -> TaskSettings:
     """The same task, seen as images: as it is, or with that many rows in place of a state.
 

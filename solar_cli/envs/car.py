@@ -8,11 +8,12 @@ bottom right, the target is in the top left.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
 from solar_cli.envs.rasteriser import Box, Disc, draw_figure, enlarge
-from solar_cli.envs.task import Floats, Frames, RowTask, check_parameters
+from solar_cli.envs.task import Floats, Frames, RowTask, StateCost, check_parameters
 from solar_cli.errors import UsageError
 from solar_cli.settings import Observation, TaskSettings
 
@@ -174,6 +175,16 @@ def build(settings: TaskSettings) -> RowTask:
             "height = width"
         )
     return RowTask(CarFromImages(settings.action_cost, seen.height), settings)
+
+
+def state_cost(settings: TaskSettings) -> StateCost:
+    """As `StateCost`, of states (..., 9)."""
+
+    def cost(states: Any, actions: Any) -> Any:
+        apart = states[..., 0:2] - states[..., 7:9]
+        return (apart * apart).sum(-1) + settings.action_cost * (actions * actions).sum(-1)
+
+    return cost
 
 
 def drawable(settings: TaskSettings, rows: int) -> TaskSettings:

@@ -250,6 +250,25 @@ def build(settings: TaskSettings) -> LoopTask:
     return LoopTask(lambda: GymnasiumEpisode(parameters, settings, camera), settings)
 
 
+def state_cost(settings: TaskSettings) -> StateCost:
+    """As `StateCost`, of the card's squares. Raises `UsageError` for a cost that is the reward's."""
+    where = f"simulator {settings.simulator!r}"
+    parameters = validated(Parameters, settings.parameters, where, "task.parameters")
+    if parameters.cost is None:
+        raise UsageError(
+            "task.parameters.cost: a reward is known of collected steps only; give squares of "
+            "entries, cost = { ENTRY = { weight = 1.0 } }"
+        )
+    entries = Entries(parameters, settings.observation.width)
+    terms = [(entries.place(entry), term) for entry, term in parameters.cost.items()]
+
+    def cost(states: Any, actions: Any) -> Any:
+        squares = sum(term.weight * (states[..., at] - term.target) ** 2 for at, term in terms)
+        return squares + settings.action_cost * (actions * actions).sum(-1)
+
+    return cost
+
+
 def drawable(settings: TaskSettings, rows: int) -> TaskSettings:
     """The same task seen as the environment renders it, ``rows`` high and in its proportions.
 

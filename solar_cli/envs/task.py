@@ -61,6 +61,10 @@ class Restartable(Task, Protocol):
         """Start new episodes in the rows ``which``, the others go on; returns the new frames."""
 
 
+StateCost = Callable[[Any, Any], Any]
+"""Costs (...) of states (..., S) as they are seen and actions (..., a), arrays or tensors alike."""
+
+
 class RowSimulator(Protocol):
     """An own simulator: pure functions over rows (N, k), one row an episode."""
 
