@@ -2,7 +2,8 @@
 
 A simulator is a module with two functions, ``build(settings) -> Restartable`` and
 ``picture(frames, factor) -> (..., H factor, W factor, 3)`` in [0, 1], and a line in `SIMULATORS`.
-One that shows states has a third, ``drawable(settings, rows)``: the same task, seen as images.
+One that shows states has a third, ``drawable(settings, rows)``: the same task, seen as images; and
+for methods that may know the cost a fourth, ``state_cost(settings)``.
 """
 
 from __future__ import annotations
@@ -13,11 +14,11 @@ from types import ModuleType
 import numpy as np
 from numpy.typing import NDArray
 
-from solar_cli.envs.task import Frames, Restartable, Task
+from solar_cli.envs.task import Frames, Restartable, StateCost, Task
 from solar_cli.errors import UsageError, nearest
 from solar_cli.settings import TaskSettings
 
-__all__ = ["SIMULATORS", "Task", "build_task", "drawable", "picture"]
+__all__ = ["SIMULATORS", "Task", "build_task", "drawable", "picture", "state_cost"]
 
 SIMULATORS = {
     "gymnasium": "solar_cli.envs.gymnasium_task",

@@ -113,15 +113,16 @@ class SquaredCost:
     """The sum of a cost's terms, and alpha |a|^2."""
 
     def __init__(self, terms: dict[str, Term], entries: Entries, action_cost: float) -> None:
-        self._places = [entries.place(entry, f"cost.{entry}") for entry in terms]
-        self._weights = np.array([term.weight for term in terms.values()])
-        self._targets = np.array([term.target for term in terms.values()])
+        self._terms = [(entries.place(name, f"cost.{name}"), term) for name, term in terms.items()]
         self._action_cost = action_cost
 
-    def __call__(self, observed: Floats, action: Floats) -> float:
-        """Of entries (S,) and an action (a,) in the card's units."""
-        squares = np.square(observed[self._places] - self._targets)
-        return float(self._weights @ squares + self._action_cost * (action @ action))
+    def __call__(self, observed: Any, action: Any) -> Any:
+        """Costs (...) of entries (..., S) and actions (..., a) in the card's units."""
+        cost = self._action_cost * (action * action).sum(-1)
+        for place, term in self._terms:
+            apart = observed[..., place] - term.target
+            cost = cost + term.weight * apart * apart
+        return cost
 
 
 class Gauge:

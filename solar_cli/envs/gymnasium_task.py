@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from solar_cli.envs import offscreen
 from solar_cli.envs.gymnasium_card import Entries, Gauge, Parameters, SquaredCost
 from solar_cli.envs.rasteriser import enlarge, shrink
-from solar_cli.envs.task import Floats, Frames, LoopTask
+from solar_cli.envs.task import Floats, Frames, LoopTask, StateCost
 from solar_cli.errors import SolarError, UsageError, nearest
 from solar_cli.settings import Observation, TaskSettings
 from solar_cli.settings.card import validated
@@ -133,7 +133,8 @@ class GymnasiumEpisode:
         if self._cost is None:
             self._after, cost = 0.0, -float(reward)
         else:
-            self._after, cost = self._cost(self._observed, 0 * action), self._cost(before, action)
+            self._after = float(self._cost(self._observed, 0 * action))
+            cost = float(self._cost(before, action))
         if self._parameters.ended_cost is not None:
             self._after = self._parameters.ended_cost
         return self._frame, cost
@@ -260,13 +261,7 @@ def state_cost(settings: TaskSettings) -> StateCost:
             "entries, cost = { ENTRY = { weight = 1.0 } }"
         )
     entries = Entries(parameters, settings.observation.width)
-    terms = [(entries.place(entry), term) for entry, term in parameters.cost.items()]
-
-    def cost(states: Any, actions: Any) -> Any:
-        squares = sum(term.weight * (states[..., at] - term.target) ** 2 for at, term in terms)
-        return squares + settings.action_cost * (actions * actions).sum(-1)
-
-    return cost
+    return SquaredCost(parameters.cost, entries, settings.action_cost)
 
 
 def drawable(settings: TaskSettings, rows: int) -> TaskSettings:

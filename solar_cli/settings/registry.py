@@ -56,6 +56,16 @@ BUILT_IN = (
         learner="solar_cli.methods.vae:Vae",
     ),
     MethodEntry(
+        name="mpc-nn",
+        summary="Neural dynamics of states, and the best of random action sequences under them and "
+        "the task's own cost.",
+        source="Nagabandi et al. 2018 (App. E.2)",
+        settings="solar_cli.settings.mpc_nn:MpcNn",
+        learner="solar_cli.methods.mpc_nn:MpcNn",
+        observations=("state",),
+        needs="true cost",
+    ),
+    MethodEntry(
         name="zero",
         summary="A reference: no action at all.",
         source="reference policy",
