@@ -252,7 +252,7 @@ def build(settings: TaskSettings) -> LoopTask:
 
 
 def state_cost(settings: TaskSettings) -> StateCost:
-    """As `StateCost`, of the card's squares. Raises `UsageError` for a cost that is the reward's."""
+    """As `StateCost`, of the card's squares. Raises `UsageError` where the reward is it."""
     where = f"simulator {settings.simulator!r}"
     parameters = validated(Parameters, settings.parameters, where, "task.parameters")
     if parameters.cost is None:

@@ -21,7 +21,8 @@ class Learner(Protocol):
     """A method at work on one cell.
 
     It is constructed as ``Learner(settings, task, streams, device, pulse)``: its own settings, the
-    `TaskSettings`, `Streams` to draw from, a torch device's name, and a `Pulse`.
+    `TaskSettings`, `Streams` to draw from, a torch device's name, and a `Pulse`. A method without
+    latents or a model of frames inherits from it, and leaves the last three as they are.
     """
 
     @property
@@ -44,9 +45,12 @@ class Learner(Protocol):
 
     def diagnose(self, evaluation: Evaluation) -> dict[str, float]:
         """Metrics of the representation against the truth: for a judge, never learned from."""
+        return {}
 
     def encode(self, episodes: Episodes) -> NDArray[Any] | None:
         """(N, T+1, d) the newest latents at every frame; None for a method without."""
+        return None
 
     def reconstruct(self, episodes: Episodes) -> NDArray[Any] | None:
         """Frames as the model sees them, like ``episodes.frames``; None for a method without."""
+        return None

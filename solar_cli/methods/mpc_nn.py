@@ -21,6 +21,7 @@ from solar_cli.control.planning import Search, random_shooting
 from solar_cli.envs import state_cost
 from solar_cli.envs.task import StateCost
 from solar_cli.episodes import Episodes, Evaluation, Experience, Policy
+from solar_cli.methods import Learner
 from solar_cli.pulse import Diverged, Pulse
 from solar_cli.settings import TaskSettings
 from solar_cli.settings.mpc_nn import MpcNn as MpcNnSettings
@@ -32,6 +33,11 @@ Floats = NDArray[np.float64]
 
 class Dynamics(nn.Module):
     """s_{t+1} = s_t + std_y f((s - mean_s) / std_s, (a - mean_a) / std_a) + mean_y."""
+
+    x_mean: Tensor
+    x_std: Tensor
+    y_mean: Tensor
+    y_std: Tensor
 
     def __init__(self, states: int, actions: int, width: int) -> None:
         super().__init__()
@@ -83,7 +89,7 @@ class Planner:
     def act(self, observations: NDArray[Any], t: int, state: Floats) -> tuple[Floats, Floats, Any]:
         """The first action of the best sequence, and noise."""
         start = torch.from_numpy(observations[:, -1].astype(np.float32))
-        start = start.to(self.dynamics.x_mean.device)  # type: ignore[arg-type]
+        start = start.to(self.dynamics.x_mean.device)
         draws = self.streams.generator("shooting", t)
 
         def uniform(*shape: int) -> Tensor:
@@ -105,7 +111,7 @@ class Planner:
         return mean + state[:, t], mean, state
 
 
-class MpcNn:
+class MpcNn(Learner):
     """MPC-NN on one cell."""
 
     def __init__(
@@ -166,12 +172,6 @@ class MpcNn:
             found = self.dynamics(x[:, :size], x[:, size:]) - x[:, :size]
         spread = (y - y.mean(dim=0)).square().sum()
         return {"one_step_r2": 1 - float((found - y).square().sum() / spread.clamp_min(1e-12))}
-
-    def encode(self, episodes: Episodes) -> None:
-        """It has no latents."""
-
-    def reconstruct(self, episodes: Episodes) -> None:
-        """It has no model of frames."""
 
 
 def transitions(episodes: Episodes) -> tuple[Float[Tensor, "n p"], Float[Tensor, "n d"]]:

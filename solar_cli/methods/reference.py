@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from solar_cli.episodes import Episodes, Evaluation, Experience, Policy
+from solar_cli.episodes import Experience, Policy
+from solar_cli.methods import Learner
 from solar_cli.pulse import Pulse
 from solar_cli.settings import TaskSettings
-from solar_cli.settings.reference import Reference as ReferenceSettings
+from solar_cli.settings.reference import Reference
 from solar_cli.streams import Streams
 
 Floats = NDArray[np.float64]
@@ -37,12 +37,12 @@ class Fixed:
         return state[:, t], state[:, t], state
 
 
-class Reference(ABC):
-    """A learner that collects and stays as it is."""
+class Zero(Learner):
+    """No action at all."""
 
     def __init__(
         self,
-        settings: ReferenceSettings,
+        settings: Reference,
         task: TaskSettings,
         streams: Streams,
         device: str,
@@ -51,9 +51,9 @@ class Reference(ABC):
         self.settings, self.task, self.streams = settings, task, streams
 
     @property
-    @abstractmethod
     def policy(self) -> Policy:
-        """The policy, which never changes."""
+        """a_t = 0."""
+        return Fixed(self.task, None)
 
     def iterate(self, experience: Experience) -> dict[str, float]:
         """Collect, so that its episodes stand beside those of learners."""
@@ -67,30 +67,11 @@ class Reference(ABC):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Nothing."""
 
-    def diagnose(self, evaluation: Evaluation) -> dict[str, float]:
-        """It has no representation to judge."""
-        return {}
 
-    def encode(self, episodes: Episodes) -> None:
-        """It has no latents."""
-
-    def reconstruct(self, episodes: Episodes) -> None:
-        """It has no model."""
-
-
-class Zero(Reference):
-    """No action at all."""
-
-    @property
-    def policy(self) -> Policy:
-        """a_t = 0."""
-        return Fixed(self.task, None)
-
-
-class Random(Reference):
+class Random(Zero):
     """Uniform draws between the bounds of actions: Gymnasium's `action_space.sample`."""
 
     @property
     def policy(self) -> Policy:
-        """a_t ~ U(-bound, bound), drawn anew for each evaluation's episodes."""
+        """a_t ~ U(-bound, bound), evaluated too: a policy without noise it has none."""
         return Fixed(self.task, self.streams)
