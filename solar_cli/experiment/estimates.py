@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from solar_cli.experiment.matrix import Action, Plan
 from solar_cli.settings import Cell
-from solar_cli.settings.local import LocalMethod
+from solar_cli.settings.local import LocalControl, LocalMethod
 from solar_cli.store.records import CellRecord, State
 
 if TYPE_CHECKING:
@@ -61,20 +61,22 @@ def memory_needs(cell: Cell) -> list[Need]:
     episode = frames * frame + task.horizon * (2 * task.action.size + 1) * FLOAT_BYTES
     sizes = ("task.horizon", "task.observation")
     needs = [Need(judged * episode, "an evaluation", ("evaluation.episodes", *sizes))]
-    if isinstance(method, LocalMethod):
-        prefix, states = f"methods.{cell.method}", method.representation.latent * seen.window
+    prefix = f"methods.{cell.method}"
+    if isinstance(method, LocalControl):
         batch, batches = max(method.batches.initial, method.batches.noisy), f"{prefix}.batches"
         needs.append(Need(batch * episode, "a batch of episodes", (batches, *sizes)))
+        named = "representation.latent" if isinstance(method, LocalMethod) else "components"
+        long, latents = (f"{prefix}.{named}", "task.horizon"), method.latents(seen)
+        matrices = task.horizon * (latents * seen.window) ** 2 * FLOAT_BYTES
+        needs.append(Need(matrices, "dynamics of latent states", long))
+        if method.local_fit.method == "posterior":
+            pairs = task.horizon**2 * FLOAT_BYTES
+            needs.append(Need(pairs, "weights of neighbouring time steps", ("task.horizon",)))
+    if isinstance(method, LocalMethod):
         training = method.training
         drawn = training.segments * min(training.length, frames) * frame
         longest = (f"{prefix}.training.segments", f"{prefix}.training.length", "task.observation")
         needs.append(Need(drawn, "a minibatch of segments", longest))
-        matrices = task.horizon * states**2 * FLOAT_BYTES
-        latent = f"{prefix}.representation.latent"
-        needs.append(Need(matrices, "dynamics of latent states", (latent, "task.horizon")))
-        if method.local_fit.method == "posterior":
-            pairs = task.horizon**2 * FLOAT_BYTES
-            needs.append(Need(pairs, "weights of neighbouring time steps", ("task.horizon",)))
     return needs
 
 
