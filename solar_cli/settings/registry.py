@@ -59,8 +59,8 @@ BUILT_IN = (
     ),
     MethodEntry(
         name="lqr-flm",
-        summary="LQR with linear models of each time step, fitted under a Gaussian-mixture prior to "
-        "states as they are, or to images' principal components.",
+        summary="LQR with a linear model fitted at each time step under a Gaussian-mixture prior, "
+        "to states as they are or to images' principal components.",
         source="Levine and Abbeel 2014 (section 6, App. E.2)",
         settings="solar_cli.settings.local:LqrFlm",
         learner="solar_cli.methods.lqr_flm:LqrFlm",
