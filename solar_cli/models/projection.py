@@ -24,7 +24,7 @@ from solar_cli.settings.local import LqrFlm
 
 CHUNK = 512  # frames in floating point at once: bounds memory
 MOST_FRAMES = 2000  # that components are found in, and judged by: a matrix has a row for each
-LEAST_SHARE = 1e-9  # of the largest component's variance: smaller ones are rounding
+LEAST_SHARE = 1e-6  # of the largest component's variance: smaller ones are float32's rounding
 LEAST_STD = 1e-6  # of an entry of a state, as for networks: a smaller one is constant
 
 
