@@ -25,7 +25,7 @@ from solar_cli.experiment.privileged import Part, World, of_positions, privilege
 from solar_cli.methods import Diverged
 from solar_cli.methods.local import LocalLearner
 from solar_cli.settings import Cell, load, method, method_names
-from solar_cli.settings.local import LocalMethod
+from solar_cli.settings.local import LocalControl
 from solar_cli.streams import Streams
 
 AS_IT_IS, ALL = "as it is", "all of these"
@@ -92,7 +92,7 @@ def _run(
 ) -> tuple[float, int, tuple[str, ...]]:
     """Level, episodes collected and notes of the cell with some parts known."""
     task, configured = cell.configuration.task, cell.configuration.method
-    assert isinstance(configured, LocalMethod)
+    assert isinstance(configured, LocalControl)
     # As in a worker: one simulator to learn in, another one to judge in.
     simulator: Task = build_task(task)
     other: Task = build_task(task)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from solar_cli.experiment.matrix import Action, Plan
 from solar_cli.settings import Cell
-from solar_cli.settings.local import LocalMethod
+from solar_cli.settings.local import LocalControl, LocalMethod
 from solar_cli.store.records import CellRecord, State
 
 if TYPE_CHECKING:
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 WORKER_BYTES = 2 * 2**30
 """memory that a worker is counted with: what a cell may take at its peak"""
 FLOAT_BYTES = 8
+COST_FITS = 5  # whose moments are held at one time: of four folds, and of all
 Kind = tuple[str, str, str]
 """task, method, variant"""
 
@@ -50,8 +51,8 @@ def memory_needs(cell: Cell) -> list[Need]:
     """What a worker holds at one time, at least: a lower bound, made of the cell's settings.
 
     Episodes of the last evaluation and of the first batch; of a local method a minibatch's frames,
-    a matrix over states for each time step, and the weights of all pairs of time steps that
-    posterior inference uses.
+    for each time step a matrix over states and moments of what a quadratic of latents is made of,
+    and the weights of all pairs of time steps that posterior inference uses.
     """
     task, method = cell.configuration.task, cell.configuration.method
     judged = cell.configuration.evaluation.episodes
@@ -61,17 +62,26 @@ def memory_needs(cell: Cell) -> list[Need]:
     episode = frames * frame + task.horizon * (2 * task.action.size + 1) * FLOAT_BYTES
     sizes = ("task.horizon", "task.observation")
     needs = [Need(judged * episode, "an evaluation", ("evaluation.episodes", *sizes))]
-    if isinstance(method, LocalMethod):
-        prefix, states = f"methods.{cell.method}", method.representation.latent * seen.window
+    if isinstance(method, LocalControl):
+        prefix = f"methods.{cell.method}"
         batch, batches = max(method.batches.initial, method.batches.noisy), f"{prefix}.batches"
         needs.append(Need(batch * episode, "a batch of episodes", (batches, *sizes)))
-        training = method.training
-        drawn = training.segments * min(training.length, frames) * frame
-        longest = (f"{prefix}.training.segments", f"{prefix}.training.length", "task.observation")
-        needs.append(Need(drawn, "a minibatch of segments", longest))
-        matrices = task.horizon * states**2 * FLOAT_BYTES
-        latent = f"{prefix}.representation.latent"
-        needs.append(Need(matrices, "dynamics of latent states", (latent, "task.horizon")))
+        if isinstance(method, LocalMethod):
+            training = method.training
+            drawn = training.segments * min(training.length, frames) * frame
+            longest = (
+                f"{prefix}.training.segments",
+                f"{prefix}.training.length",
+                "task.observation",
+            )
+            needs.append(Need(drawn, "a minibatch of segments", longest))
+        named = "representation.latent" if isinstance(method, LocalMethod) else "components"
+        long, latents = (f"{prefix}.{named}", "task.horizon"), method.latents(seen)
+        matrices = task.horizon * (latents * seen.window) ** 2 * FLOAT_BYTES
+        needs.append(Need(matrices, "dynamics of latent states", long))
+        monomials = (latents + 1) * (latents + 2) // 2  # of a quadratic
+        moments = COST_FITS * task.horizon * monomials**2 * FLOAT_BYTES
+        needs.append(Need(moments, "moments of the cost fit", long))
         if method.local_fit.method == "posterior":
             pairs = task.horizon**2 * FLOAT_BYTES
             needs.append(Need(pairs, "weights of neighbouring time steps", ("task.horizon",)))

@@ -25,8 +25,9 @@ from solar_cli.episodes import Episodes, Experience, Policy, roll_out
 from solar_cli.methods.local import LocalLearner
 from solar_cli.models.priors import LatentPrior
 from solar_cli.models.representation import Representation
+from solar_cli.models.state_representation import StateRepresentation
 from solar_cli.settings import Observation, TaskSettings
-from solar_cli.settings.local import CostFit, LocalMethod
+from solar_cli.settings.local import CostFit, LocalControl, LocalMethod
 from solar_cli.streams import Streams
 
 ROLLOUTS = 20
@@ -89,8 +90,8 @@ def seen_whole(task: Task) -> Task:
 
 
 def of_positions(
-    task: TaskSettings, method: LocalMethod, size: int
-) -> tuple[TaskSettings, LocalMethod]:
+    task: TaskSettings, method: LocalControl, size: int
+) -> tuple[TaskSettings, LocalControl]:
     """Settings for frames of ``size`` positions, in the card's window: the network is no layer."""
     observation = Observation(kind="state", width=size, window=task.observation.window)
     identity = {
@@ -102,11 +103,10 @@ def of_positions(
         "likelihood": "gaussian",
         "input": "standardised",
     }
-    representation = method.representation.model_copy(update=identity)
-    return (
-        task.model_copy(update={"observation": observation}),
-        method.model_copy(update={"representation": representation}),
-    )
+    if isinstance(method, LocalMethod):
+        representation = method.representation.model_copy(update=identity)
+        method = method.model_copy(update={"representation": representation})
+    return task.model_copy(update={"observation": observation}), method
 
 
 class TrueState(Representation):
@@ -143,9 +143,9 @@ class Privileged(LocalLearner):
         self._rollouts: Trajectories | None = None
         super().__init__(*arguments)
 
-    def make_representation(self) -> Representation:
-        """True positions, or the method's own."""
-        if Part.STATE not in self.given:
+    def make_representation(self) -> StateRepresentation:
+        """True positions, or the method's own; one that learns none takes positions as they are."""
+        if Part.STATE not in self.given or not isinstance(self.settings, LocalMethod):
             return super().make_representation()
         return TrueState(
             self.settings,

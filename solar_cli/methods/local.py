@@ -33,9 +33,10 @@ from solar_cli.episodes import Episodes, Evaluation, Experience
 from solar_cli.models.diagnostics import latent_metrics
 from solar_cli.models.priors import LatentPrior, Prior
 from solar_cli.models.representation import Representation
+from solar_cli.models.state_representation import StateRepresentation
 from solar_cli.pulse import Diverged, Pulse
 from solar_cli.settings import TaskSettings
-from solar_cli.settings.local import LocalMethod
+from solar_cli.settings.local import LocalControl, LocalMethod
 from solar_cli.streams import Streams
 
 MOST_BATCHES = 4
@@ -47,7 +48,7 @@ class LocalLearner(ABC):
 
     def __init__(
         self,
-        settings: LocalMethod,
+        settings: LocalControl,
         task: TaskSettings,
         streams: Streams,
         device: str,
@@ -58,7 +59,7 @@ class LocalLearner(ABC):
         self.streams = streams
         self.device = device
         self.pulse = pulse
-        self.latent = settings.representation.latent
+        self.latent = settings.latents(task.observation)
         self.representation = self.make_representation()
         self.gains = initial_policy(
             task.horizon, self.representation.state_size, task.action.size, task.exploration.std
@@ -76,8 +77,9 @@ class LocalLearner(ABC):
     def iterate(self, experience: Experience) -> dict[str, float]:
         """As `Learner.iterate`: one turn of Algorithm 1."""
 
-    def make_representation(self) -> Representation:
+    def make_representation(self) -> StateRepresentation:
         """An untrained representation."""
+        assert isinstance(self.settings, LocalMethod)
         return Representation(
             self.settings,
             self.task,
@@ -185,7 +187,7 @@ class LocalLearner(ABC):
         return newest.until(newest.planned), [batch.until(newest.planned) for batch in others]
 
     @staticmethod
-    def _embedded(representation: Representation, episodes: Episodes) -> Trajectories:
+    def _embedded(representation: StateRepresentation, episodes: Episodes) -> Trajectories:
         return Trajectories.of(representation.embed(episodes).cpu(), episodes)
 
     def latent_prior(self, older: list[list[Episodes]]) -> LatentPrior:
@@ -315,6 +317,6 @@ class LocalLearner(ABC):
         self.trust_region = self.trust_region.restored(state["trust_region"])
         self.updates = state["updates"]
 
-    def _cost_score(self, representation: Representation, batches: list[Episodes]) -> float:
+    def _cost_score(self, representation: StateRepresentation, batches: list[Episodes]) -> float:
         states = Trajectories.joined([self._embedded(representation, one) for one in batches])
         return self.fitted_cost(states, []).r2

@@ -12,7 +12,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from solar_cli.episodes import window_indices
+
 LEAST_SHARE = 1e-4  # of the largest eigenvalue: latents with less variance are noise
+
+
+def windows_of(latents: Float[Tensor, "N T1 d"], window: int) -> Float[Tensor, "N T1 W d"]:
+    """Windows that end at each frame of whole episodes, the newest frame first."""
+    index = window_indices(latents.shape[1] - 1, window)
+    return latents[:, torch.from_numpy(index[:, ::-1].copy()).to(latents.device)]
 
 
 class LatentBasis(NamedTuple):
@@ -42,6 +50,13 @@ class LatentBasis(NamedTuple):
         b = torch.zeros(size, dtype=windows.dtype, device=windows.device)
         b[:d] = -white @ centre
         return LatentBasis(A, b)
+
+    @staticmethod
+    def plain(windows: Float[Tensor, "n W d"]) -> LatentBasis:
+        """Windows of latents as they are."""
+        size = windows.shape[1] * windows.shape[2]
+        A = torch.eye(size, dtype=windows.dtype, device=windows.device)
+        return LatentBasis(A, torch.zeros_like(A[0]))
 
     def state(self, windows: Float[Tensor, "*batch W d"]) -> Float[Tensor, "*batch Wd"]:
         """z of windows, newest block first."""

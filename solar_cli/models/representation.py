@@ -16,10 +16,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from solar_cli.episodes import Batch, Episodes, Experience, window_indices
+from solar_cli.episodes import Batch, Episodes, Experience
 from solar_cli.errors import UsageError
 from solar_cli.inference import mniw
-from solar_cli.models.basis import LatentBasis
+from solar_cli.models.basis import LatentBasis, windows_of
 from solar_cli.models.frames import FrameModel
 from solar_cli.models.latent_model import LatentModel
 from solar_cli.models.likelihoods import explained_variance
@@ -288,12 +288,13 @@ class Representation:
         return torch.from_numpy(episodes.frames[episodes.live_frames]).to(self.device)
 
     def _windows(self, latents: Float[Tensor, "N T1 d"]) -> Float[Tensor, "N T1 W d"]:
-        """The newest frame first."""
-        index = window_indices(latents.shape[1] - 1, self.task.observation.window)
-        return latents[:, torch.from_numpy(index[:, ::-1].copy()).to(latents.device)]
+        return windows_of(latents, self.task.observation.window)
 
     def _whitening(self, segments: Segments) -> LatentBasis:
-        return LatentBasis.whitening(segments.counted(self._windows(segments.mean)))
+        windows = segments.counted(self._windows(segments.mean))
+        if not self.settings.whitening:
+            return LatentBasis.plain(windows)
+        return LatentBasis.whitening(windows)
 
     def _parameters(self) -> dict[str, Any]:
         networks = {

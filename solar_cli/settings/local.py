@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
 from solar_cli.settings.networks import BUMPS, KEY_POINTS, Layer
 from solar_cli.settings.schema import MOST_EPISODES, Settings, setting
+from solar_cli.settings.task import Observation
 
 Positive = Annotated[float, Field(gt=0)]
 
@@ -180,16 +182,32 @@ class PolicyUpdate(Settings):
         return self
 
 
-class LocalMethod(Settings):
-    """A local method in the latent space: SOLAR and its ablations."""
+class LocalControl(Settings):
+    """What every local method is told, whatever its states are."""
 
     batches: Batches = setting(..., "line 4 of Algorithm 1")
     budget: Budget = setting(..., "where to stop", presentation=True)
-    representation: Representation = setting(Representation(), "networks")
-    training: Training = setting(Training(), "line 5 of Algorithm 1")
+    whitening: bool = setting(
+        True, "states have unit variance, and differences in place of older latents", added=True
+    )
     local_fit: LocalFit = setting(LocalFit(), "line 7 of Algorithm 1")
     cost_fit: CostFit = setting(CostFit(), "quadratic cost")
     update: PolicyUpdate = setting(PolicyUpdate(), "lines 6 and 8 of Algorithm 1")
+
+    def latents(self, observation: Observation) -> int:
+        """d: entries that a state has of one frame."""
+        raise NotImplementedError
+
+
+class LocalMethod(LocalControl):
+    """A local method in the latent space: SOLAR and its ablations."""
+
+    representation: Representation = setting(Representation(), "networks")
+    training: Training = setting(Training(), "line 5 of Algorithm 1")
+
+    def latents(self, observation: Observation) -> int:
+        """As many as the representation has."""
+        return self.representation.latent
 
 
 class Solar(LocalMethod):
@@ -203,3 +221,17 @@ class Vae(LocalMethod):
 
     training: Training = setting(Training(standard_normal=0.0), "line 5 of Algorithm 1")
     local_fit: LocalFit = setting(LocalFit(method="gmm"), "line 7 of Algorithm 1")
+
+
+class LqrFlm(LocalControl):
+    """LQR with fitted linear models: states as they are, or principal components of images."""
+
+    components: int = setting(
+        20, "principal components of an image; an observed state is taken whole", ge=1, le=50
+    )
+    local_fit: LocalFit = setting(LocalFit(method="gmm"), "line 7 of Algorithm 1")
+
+    def latents(self, observation: Observation) -> int:
+        """Entries of an observed state, or principal components of an image."""
+        size = math.prod(observation.frame_shape)
+        return min(self.components, size) if observation.kind == "image" else size

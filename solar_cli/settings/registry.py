@@ -36,6 +36,8 @@ class MethodEntry:
     """kinds of observation it can learn from"""
     needs: Literal["costs", "true cost"] = "costs"
     """whether it sees the collected costs only, or the task's cost function"""
+    deviations: str = ""
+    """where it departs from its source, and why"""
 
 
 BUILT_IN = (
@@ -54,6 +56,18 @@ BUILT_IN = (
         source="section 6, VAE ablation",
         settings="solar_cli.settings.local:Vae",
         learner="solar_cli.methods.vae:Vae",
+    ),
+    MethodEntry(
+        name="lqr-flm",
+        summary="LQR with a linear model fitted at each time step under a Gaussian-mixture prior, "
+        "to states as they are or to images' principal components.",
+        source="Levine and Abbeel 2014 (section 6, App. E.2)",
+        settings="solar_cli.settings.local:LqrFlm",
+        learner="solar_cli.methods.lqr_flm:LqrFlm",
+        deviations="Images are seen by their principal components in the first batch: a linear "
+        "model of all pixels at each time step fits no memory. The cost is fitted to collected "
+        "costs, as App. E.2 has it. The rules around an update are SOLAR's here: going back to the "
+        "best policy, bounds of its noise, the step's adaptation.",
     ),
     MethodEntry(
         name="mpc-nn",

@@ -13,7 +13,7 @@ from scipy import stats
 
 from solar_cli.control.local_dynamics import ACTION_RIDGE, infer_dynamics
 from solar_cli.control.trajectories import Trajectories
-from solar_cli.inference import mniw
+from solar_cli.inference import gmm, mniw
 from solar_cli.models.basis import LatentBasis
 from solar_cli.models.priors import LatentPrior
 from solar_cli.settings.local import LocalFit
@@ -468,3 +468,50 @@ def test_a_mixture_prior_is_drawn_from_its_streams():
     )
     assert torch.equal(first.F, again.F)
     assert not torch.equal(first.F, other.F)
+
+
+def test_a_mixture_prior_gives_the_fit_of_guided_policy_search():
+    """Levine and Abbeel's normal-inverse-Wishart fit of [x; u; x'], time step by time step.
+
+    Here it is increments that are fitted: a linear change of the point, which changes no Gaussian.
+    """
+    newest, basis = states(*first_order(12, seed=5, varying=0.3)[:2])
+    past = states(*first_order(30, seed=6, varying=0.3)[:2], basis=basis)[0]
+    found = infer(newest, basis, only_data(method="gmm"), [past]).model
+    batches = [np.concatenate(regression_inputs(one), axis=-1) for one in (newest, past)]
+    flat = torch.as_tensor(np.concatenate([one.reshape(-1, 2 * d + a) for one in batches]))
+    clusters = gmm.cluster_count(len(flat))
+    mixture = gmm.fit_mixture(flat, clusters, Streams(0).generator("mixture")).mixture
+    change = np.eye(2 * d + a)
+    change[d + a :, :d] = np.eye(d)  # x' = x + increment
+    means = mixture.means.numpy() @ change.T
+    covariances = change @ mixture.covariances.numpy() @ change.T
+    D, P, p = 2 * d + a, len(flat), d + a
+    for t, own in enumerate(batches[0] @ change.T):
+        N = len(own)
+        joint = np.stack(
+            [
+                float(w) * stats.multivariate_normal(mean, covariance).pdf(own)
+                for w, mean, covariance in zip(mixture.weights, means, covariances, strict=True)
+            ]
+        )
+        weights = (joint / joint.sum(axis=0)).mean(axis=1)
+        mu0 = sum(w * mean for w, mean in zip(weights, means, strict=True))
+        Phi = sum(
+            w * (covariance + np.outer(mean - mu0, mean - mu0))
+            for w, mean, covariance in zip(weights, means, covariances, strict=True)
+        )
+        m, n0 = 1.0, (P - 2 - D) / P
+        mu = own.mean(axis=0)
+        empirical = sum(np.outer(point - mu, point - mu) for point in own) / N
+        shift = np.outer(mu - mu0, mu - mu0)
+        Sigma = (N * empirical + Phi + N * m / (N + m) * shift) / (N + n0)
+        xx = Sigma[:p, :p] + 1e-6 * np.diag(np.diag(Sigma)[:p])
+        F = np.linalg.solve(xx, Sigma[:p, p:]).T
+        # A ridge of a millionth of the variances pulls increments to zero here, and x' there.
+        tolerance = 2e-6 * np.linalg.cond(xx)
+        assert tolerance < 1e-3
+        np.testing.assert_allclose(found.F[t], F, atol=tolerance)
+        np.testing.assert_allclose(found.f[t], mu[p:] - F @ mu[:p], atol=tolerance)
+        noise = Sigma[p:, p:] - F @ xx @ F.T
+        np.testing.assert_allclose(found.Sigma[t], noise, rtol=1e-4, atol=5e-6)

@@ -1,10 +1,14 @@
 """What cells will take: measured on finished seeds of the same kind, and foreseen by size."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
+from solar_cli.control import quadratic_cost
+from solar_cli.control.trajectories import Trajectories
 from solar_cli.experiment.estimates import (
     WORKER_BYTES,
     Estimate,
@@ -15,6 +19,7 @@ from solar_cli.experiment.estimates import (
 from solar_cli.experiment.judge import Judge
 from solar_cli.experiment.matrix import Action, Plan
 from solar_cli.settings import Cell, cells, load_card
+from solar_cli.settings.local import CostFit
 from solar_cli.store.owner import Owner
 from solar_cli.store.records import Outcome
 from solar_cli.store.store import Store
@@ -77,7 +82,7 @@ def test_what_is_held_in_memory_is_foreseen() -> None:
     evaluated = Judge(cell).evaluate(Still(), 0).episodes
     parts = (evaluated.frames, evaluated.actions, evaluated.action_means, evaluated.costs)
     held = sum(part.nbytes for part in parts)
-    evaluation, batch, minibatch, dynamics, weights = memory_needs(cell)
+    evaluation, batch, minibatch, dynamics, _, weights = memory_needs(cell)
     assert evaluation.bytes == held
     assert batch.bytes == held / 5 * 80  # the card's first batch
     assert minibatch.bytes == evaluated.frames[:1, :4].nbytes * 30  # the card's segments
@@ -90,6 +95,31 @@ def test_frames_of_a_state_are_single_precision() -> None:
     vector = 'task.observation={kind="state", width=512}'  # 4 bytes an entry: 2048, as the images
     [state] = cells(load_card("nav"), "solar", [0], sets=[vector])
     assert memory_needs(state)[0].bytes == memory_needs(image)[0].bytes
+
+
+@pytest.mark.parametrize(("name", "latents"), [("solar", 4), ("lqr-flm", 20)])
+def test_moments_of_the_cost_fit_are_those_that_it_holds(
+    monkeypatch: pytest.MonkeyPatch, name: str, latents: int
+) -> None:
+    """Of LQR-FLM they are more than its episodes: a limit for principal components."""
+    [cell] = cells(load_card("nav"), name, [0])
+    T, rng = cell.configuration.task.horizon, np.random.default_rng(0)
+    z = torch.as_tensor(rng.normal(size=(8, T + 1, latents)))
+    costs = z[:, :-1].square().sum(dim=-1)
+    actions = torch.zeros(8, T, 2).double()
+    held: list[int] = []
+
+    def looked_at(folds: list[Any], whole: Any, *_: Any) -> dict[quadratic_cost.Choice, float]:
+        held.extend(part.xx.nbytes for part in (*folds, whole))
+        return {quadratic_cost.Choice(0.0, 0.0, per_time=False): 1.0}
+
+    monkeypatch.setattr(quadratic_cost, "_held_out", looked_at)
+    monkeypatch.setattr(quadratic_cost, "LBFGS_ROUNDS", 1)
+    states = Trajectories(z, actions, actions, costs, costs > -1)
+    quadratic_cost.fit_quadratic_cost(states, [], 0.0, CostFit(), latents)
+    [need] = [need for need in memory_needs(cell) if need.what == "moments of the cost fit"]
+    assert need.bytes == sum(held)
+    assert need.settings[0].endswith("latent" if name == "solar" else "components")
 
 
 def test_a_large_cell_is_estimated_by_its_size(store: Store) -> None:

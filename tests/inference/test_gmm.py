@@ -131,6 +131,23 @@ def test_joint_fit_shrinks_the_scatter_towards_the_prior():
     np.testing.assert_allclose(covariance[0], expected, atol=1e-12)
 
 
+def test_joint_fit_is_the_scatter_of_real_and_imagined_points():
+    """The prior as what it stands for: m points with mean mu0 and scatter Phi."""
+    rng = np.random.default_rng(11)
+    points, mu0, m, n0 = rng.normal(size=(7, 3)), rng.normal(size=3), 2.5, 1.75
+    root = rng.normal(size=(3, 3))
+    Phi = root @ root.T
+    arms = np.sqrt(3 / m) * root.T
+    imagined = mu0 + np.concatenate([arms, -arms])
+    everything = np.concatenate([points, imagined])
+    weight = np.concatenate([np.ones(7), np.full(6, m / 6)])
+    deviation = everything - weight @ everything / weight.sum()
+    scatter = sum(w * np.outer(x, x) for w, x in zip(weight, deviation, strict=True))
+    prior = LocalPrior(torch.as_tensor(mu0)[None], torch.as_tensor(Phi)[None], m, n0)
+    found = gmm.fit_joint(torch.as_tensor(points)[None], prior)
+    np.testing.assert_allclose(found.covariance[0], scatter / (7 + n0), rtol=1e-12)
+
+
 def test_conditioning_a_data_rich_joint_is_least_squares_with_an_intercept():
     rng = np.random.default_rng(9)
     x = rng.normal(size=(2, 200, 3)) * [1.0, 1e-2, 10.0] + [0.0, 5.0, -3.0]

@@ -12,6 +12,7 @@ from bits import digest, through_a_file
 from solar_cli.envs import build_task
 from solar_cli.episodes import Environment, Experience
 from solar_cli.settings import cells, load, load_card, method
+from solar_cli.settings.registry import settings_class
 from solar_cli.streams import Streams
 
 
@@ -31,7 +32,8 @@ class Run:
         wrap: Callable[[Any], Any] = lambda task: task,
         costs: Callable[[int, np.ndarray], np.ndarray] | None = None,
     ) -> None:
-        small = ("training.steps=12", 'cost_fit.per_time="never"', *sets)
+        trained = "training" in settings_class(method(name)).model_fields
+        small = (*["training.steps=12"] * trained, 'cost_fit.per_time="never"', *sets)
         changes = ["task.horizon=6", *(f"methods.{name}.{text}" for text in small)]
         [cell] = cells(load_card("nav"), name, [seed], "smoke", changes)
         self.configuration = cell.configuration

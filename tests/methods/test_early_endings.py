@@ -10,6 +10,7 @@ from method_runs import Run
 from solar_cli.methods import solar
 
 both = pytest.mark.parametrize("name", ["solar", "vae"])
+every = pytest.mark.parametrize("name", ["solar", "vae", "lqr-flm"])
 
 
 class Ending:
@@ -43,7 +44,7 @@ def run(folder, name, rubbish=0, *sets):
     return Run(folder, name, *sets, wrap=lambda task: Ending(task, rubbish)).iterate(1, 3)
 
 
-@both
+@every
 def test_episodes_end_early_and_learning_goes_on(tmp_path, name):
     done = run(tmp_path, name)
     lengths = np.concatenate([collected_in(i, done.environment).lengths for i in (1, 2, 3)])

@@ -15,6 +15,7 @@ from solar_cli.methods import Diverged, local, solar
 from solar_cli.streams import Streams
 
 both = pytest.mark.parametrize("name", ["solar", "vae"])
+every = pytest.mark.parametrize("name", ["solar", "vae", "lqr-flm"])
 
 
 NOISE_FREE = "batches={ initial = 8, noisy = 5, noise_free = 3 }"
@@ -60,7 +61,7 @@ def test_an_update_that_promises_little_is_tried_before_it_is_handed_over(
     torch.testing.assert_close(z.action_means, means)  # the newest is what is tried
 
 
-@both
+@every
 def test_noise_alone_is_no_promise_of_what_has_none(tmp_path, monkeypatch, name):
     """Two policies that differ in their noise alone are the same where none is drawn."""
     calls = spied(monkeypatch, "promised_fall")
@@ -74,7 +75,7 @@ def test_noise_alone_is_no_promise_of_what_has_none(tmp_path, monkeypatch, name)
 # Collecting
 
 
-@both
+@every
 def test_batches_are_those_of_the_card(tmp_path, name):
     run = Run(tmp_path, name, "batches={ initial = 7, noisy = 5 }").iterate(1, 3)
     assert [len(collected_in(i, run.environment)) for i in (1, 2, 3)] == [7, 5, 5]
@@ -184,7 +185,7 @@ def test_older_batches_are_the_last_ones_newest_first(tmp_path, monkeypatch):
 # Bounds
 
 
-@both
+@every
 def test_the_policys_std_stays_within_its_bounds(tmp_path, name):
     run = Run(
         tmp_path, name, "update.early_updates=1", "update.std_floor=[0.9, 0.5]",
@@ -199,7 +200,7 @@ def test_the_policys_std_stays_within_its_bounds(tmp_path, name):
     assert float(found.min()) < 0.9  # so the later floor is another one
 
 
-@both
+@every
 def test_the_kl_bound_is_kept_and_scaled_by_the_step(tmp_path, monkeypatch, name):
     calls = spied(monkeypatch, "improve_policy")
     run = Run(tmp_path, name, "update.kl_step=0.3").iterate(1, 3)
@@ -220,7 +221,7 @@ def test_without_a_kl_bound_the_update_is_the_unconstrained_one(tmp_path, monkey
 # What is not finite
 
 
-@both
+@every
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 @pytest.mark.parametrize("iteration", [1, 2])
 @pytest.mark.parametrize("noisy", [False, True])
@@ -284,7 +285,7 @@ def test_metrics_are_named_finite_numbers(tmp_path, name):
 # Checks of the task
 
 
-@both
+@every
 def test_checks_of_the_task_are_stored_and_change_nothing(tmp_path, monkeypatch, name):
     run = Run(tmp_path / "with", name).iterate(1, 2)
     for metrics in run.metrics:

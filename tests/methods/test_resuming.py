@@ -38,11 +38,15 @@ def test_a_run_interrupted_at_any_pulse_ends_with_the_same_bits(tmp_path, name, 
         assert resumed.bits() == whole.bits()
 
 
-@pytest.mark.parametrize("name", ["solar", "vae"])
+@pytest.mark.parametrize(
+    ("name", "sets"), [("solar", FINE_TUNING), ("vae", FINE_TUNING), ("lqr-flm", ())]
+)
 @pytest.mark.parametrize("noise_free", [0, 2])
-def test_a_run_interrupted_while_it_collects_ends_with_the_same_bits(tmp_path, name, noise_free):
+def test_a_run_interrupted_while_it_collects_ends_with_the_same_bits(
+    tmp_path, name, sets, noise_free
+):
     """With episodes that judge, the third iteration is rejected: the best collects again."""
-    sets = (*FINE_TUNING, f"batches.noise_free={noise_free}")
+    sets = (*sets, f"batches.noise_free={noise_free}")
     last, saved, more = 3, [], {2: -1.0, 3: 1e3} if noise_free else {}
 
     steps = count(1)
@@ -65,7 +69,7 @@ def test_a_run_interrupted_while_it_collects_ends_with_the_same_bits(tmp_path, n
         assert resumed.bits() == whole.bits()
 
 
-@pytest.mark.parametrize("name", ["solar", "vae"])
+@pytest.mark.parametrize("name", ["solar", "vae", "lqr-flm"])
 def test_a_run_interrupted_between_iterations_ends_with_the_same_bits(tmp_path, name):
     whole = Run(tmp_path / "whole", name, *FLOORS)
     parts = Run(tmp_path / "parts", name, *FLOORS).iterate(1, 1)
@@ -86,7 +90,7 @@ def test_an_iteration_that_is_repeated_gives_the_same_bits(tmp_path):
     assert again.bits() == once.bits()
 
 
-@pytest.mark.parametrize("name", ["solar", "vae"])
+@pytest.mark.parametrize("name", ["solar", "vae", "lqr-flm"])
 def test_a_cell_has_its_bits(tmp_path, name):
     runs = [Run(tmp_path / str(i), name, seed=i // 2).iterate(1, 2) for i in range(3)]
     assert runs[0].bits() == runs[1].bits()

@@ -25,11 +25,18 @@ class Blind:
         raise RuntimeError("not for learners")
 
 
-@pytest.mark.parametrize("name", ["solar", "vae"])
-def test_evaluating_never_once_or_ten_times_gives_the_same_policies(tmp_path, name):
+@pytest.mark.parametrize(
+    ("name", "sets"),
+    [
+        ("solar", ["training.fine_tune_steps=4"]),
+        ("vae", ["training.fine_tune_steps=4"]),
+        ("lqr-flm", []),
+    ],
+)
+def test_evaluating_never_once_or_ten_times_gives_the_same_policies(tmp_path, name, sets):
     found = set()
     for times in (0, 1, 10):
-        run = Run(tmp_path / str(times), name, "training.fine_tune_steps=4")
+        run = Run(tmp_path / str(times), name, *sets)
         task = run.configuration.task
         for iteration in (1, 2):
             run.iterate(iteration, iteration)
@@ -44,7 +51,7 @@ def test_evaluating_never_once_or_ten_times_gives_the_same_policies(tmp_path, na
 
 
 @pytest.mark.filterwarnings("ignore:ground truth is missing")
-@pytest.mark.parametrize("name", ["solar", "vae"])
+@pytest.mark.parametrize("name", ["solar", "vae", "lqr-flm"])
 def test_measures_are_out_of_a_learners_reach(tmp_path, name):
     seeing = Run(tmp_path / "seeing", name).iterate(1, 2)
     blind = Run(tmp_path / "blind", name, wrap=Blind).iterate(1, 2)

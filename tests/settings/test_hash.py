@@ -78,6 +78,7 @@ def test_what_only_shapes_a_report_or_the_stopping_point_is_not_hashed(change: s
         "methods.solar.training.steps=1999",
         "methods.solar.update.linearise=false",
         "methods.solar.local_fit.widths=[2.0]",
+        "methods.solar.whitening=false",
     ],
 )
 def test_what_can_change_a_number_is_hashed(change: str) -> None:
@@ -113,7 +114,8 @@ def test_every_setting_is_hashed_or_declared_not_to_matter() -> None:
         for name, field in type(part).model_fields.items():
             extra = field.json_schema_extra
             assert isinstance(extra, dict)
-            assert (name in hashed) == (not extra["presentation"])
+            as_ever = "added" in extra and getattr(part, name) == extra["added"]
+            assert (name in hashed) == (not extra["presentation"] and not as_ever)
 
 
 def test_configurations_cannot_be_changed_after_they_are_made() -> None:
