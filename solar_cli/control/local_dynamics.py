@@ -84,8 +84,11 @@ def infer_dynamics(
         score = scores[best]
         metrics = {f"prior_{name}": value for name, value in grid[best]._asdict().items()}
     else:
-        mixture = partial(_mixture_prior, past, streams)
-        fit = _regression if settings.method == "regression" else mixture
+        fit = {
+            "regression": _regression,
+            "gmm": partial(_mixture_prior, past, streams),
+            "network": partial(_linearised, prior, settings),
+        }[settings.method]
         score = _held_out(fit, samples, settings.folds)
     metrics |= {"one_step_log_likelihood": score.log_likelihood, "one_step_r2": score.r2}
     return LocalDynamics(_whole(fit(samples), newest, prior), metrics)
@@ -259,6 +262,35 @@ def _mixture_prior(
     points, live = torch.cat([samples.x, samples.y], dim=-1)[:sampled], samples.live[:sampled]
     joint = gmm.fit_joint(points, gmm.local_prior(fit.mixture, points, live), live)
     F, f, Sigma = gmm.condition_joint(joint, samples.x.shape[-1])
+    return _increments(F, f, Sigma, samples)
+
+
+def _linearised(prior: LatentPrior, settings: LocalFit, samples: Transitions) -> Increments:
+    """The model's own network, linearised at the mean of every time step.
+
+    Slopes are the network's. Its errors on these samples give the offset, by their mean, and Sigma.
+    """
+    network, basis, d = prior.transition, prior.basis, prior.latent
+    assert network is not None
+    x_mean, y_mean = samples.means()
+    z, a = x_mean[:, 0].split([len(basis.b), x_mean.shape[-1] - len(basis.b)], dim=-1)
+    inverse, white = torch.linalg.inv(basis.A), basis.A[:d, :d]
+    windows = (z - basis.b) @ inverse.T
+    successor, of_windows, of_actions = network.linearised(windows, a)
+    slopes = of_windows @ inverse
+    F = white @ torch.cat([slopes, of_actions], dim=-1)
+    F[..., :d] -= torch.eye(d).to(F)
+    f = (successor - windows[:, :d]) @ white.T - (F @ x_mean.mT).squeeze(-1)
+    one = samples.live.unsqueeze(-1)
+    residual = (samples.y - samples.x @ F.mT - f.unsqueeze(1)) * one
+    import os
+    if os.environ.get("OFFSET", "1") == "1":
+        bias = residual.sum(dim=1, keepdim=True) / samples.counts[:, None, None]
+        f = f + bias[:, 0]
+        residual = (residual - bias) * one
+    degrees = d + 2
+    weak = degrees * settings.ridge**2 * torch.eye(d).to(F)
+    Sigma = (residual.mT @ residual + weak) / (samples.counts + degrees)[:, None, None]
     return _increments(F, f, Sigma, samples)
 
 

@@ -53,7 +53,7 @@ class Trainer:
         """
         data, fine_tuning = Dataset(batches, self.device, newest), newest > 0
         optimiser = torch.optim.Adam(
-            model.networks.parameters(), lr=self.settings.learning_rate, fused=True
+            model.parameters(), lr=self.settings.learning_rate, fused=True
         )
         if self._running is None or self._running["name"] != name:
             self._running = {"name": name, "step": 0, "terms": {}, "seconds": 0.0}
@@ -101,9 +101,7 @@ class Trainer:
         loss, statistics, terms = model.loss(batch, kl_weight)
         optimiser.zero_grad()
         torch.autograd.backward(loss)
-        torch.nn.utils.clip_grad_norm_(
-            model.networks.parameters(), self.settings.clip, foreach=True
-        )
+        torch.nn.utils.clip_grad_norm_(model.parameters(), self.settings.clip, foreach=True)
         optimiser.step()
         model.prior.learn(statistics, scale)
         return loss.detach(), terms

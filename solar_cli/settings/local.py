@@ -77,6 +77,17 @@ class Dynamics(Settings):
     )
 
 
+class Transition(Settings):
+    """RCE's networks of transitions: z' = A z + B u + o at every place, A = I + v r^T."""
+
+    hidden: tuple[Annotated[int, Field(ge=1)], ...] = setting(
+        (100, 100), "rectified layers of the network for A, B and o", "E2C"
+    )
+    recognition: tuple[Annotated[int, Field(ge=1)], ...] = setting(
+        (100,), "rectified layers of q(zbar | x, z'): the place of the linearisation"
+    )
+
+
 class Training(Settings):
     """Stochastic maximisation of the ELBO (section 3)."""
 
@@ -104,8 +115,10 @@ class Training(Settings):
 class LocalFit(Settings):
     """INFERDYNAMICS: where the prior of a time step's posterior comes from (section 4.1)."""
 
-    method: Literal["posterior", "regression", "gmm"] = setting(
-        "posterior", "posterior inference; least squares; a Gaussian-mixture prior (LQR-FLM)"
+    method: Literal["posterior", "regression", "gmm", "network"] = setting(
+        "posterior",
+        "posterior inference; least squares; a Gaussian-mixture prior (LQR-FLM); the model's own "
+        "transition network, linearised (rce)",
     )
     prior_counts: tuple[float, ...] | Literal["own"] = setting(
         (0.0, 1.0, 10.0, 100.0),
@@ -203,3 +216,10 @@ class Vae(LocalMethod):
 
     training: Training = setting(Training(standard_normal=0.0), "line 5 of Algorithm 1")
     local_fit: LocalFit = setting(LocalFit(method="gmm"), "line 7 of Algorithm 1")
+
+
+class Rce(LocalMethod):
+    """RCE: a network of locally linear transitions is the prior and, linearised, the dynamics."""
+
+    transition: Transition = setting(Transition(), "the model's own dynamics")
+    local_fit: LocalFit = setting(LocalFit(method="network"), "line 7 of Algorithm 1")

@@ -56,6 +56,14 @@ BUILT_IN = (
         learner="solar_cli.methods.vae:Vae",
     ),
     MethodEntry(
+        name="rce",
+        summary="SOLAR with robust locally linear controllable embedding, an E2C, in place of the "
+        "structured model; local dynamics by linearising its transition network.",
+        source="Banijamali et al. 2018 (section 6, E2C-like ablation)",
+        settings="solar_cli.settings.local:Rce",
+        learner="solar_cli.methods.rce:Rce",
+    ),
+    MethodEntry(
         name="mpc-nn",
         summary="Neural dynamics of states, and the best of random action sequences under them and "
         "the task's own cost.",
