@@ -266,29 +266,24 @@ def _mixture_prior(
 
 
 def _linearised(prior: LatentPrior, settings: LocalFit, samples: Transitions) -> Increments:
-    """The model's own network, linearised at the mean of every time step.
+    """The slopes of the model's own network at the mean of every time step.
 
-    Slopes are the network's. Its errors on these samples give the offset, by their mean, and Sigma.
+    Its errors on these samples give the rest: their mean goes to the offset, as with every other
+    fit, and their spread is Sigma, with a weak prior for the few samples of a step.
     """
     network, basis, d = prior.transition, prior.basis, prior.latent
     assert network is not None
     x_mean, y_mean = samples.means()
-    z, a = x_mean[:, 0].split([len(basis.b), x_mean.shape[-1] - len(basis.b)], dim=-1)
+    states = x_mean[:, 0, : len(basis.b)]
     inverse, white = torch.linalg.inv(basis.A), basis.A[:d, :d]
-    windows = (z - basis.b) @ inverse.T
-    successor, of_windows, of_actions = network.linearised(windows, a)
-    slopes = of_windows @ inverse
-    F = white @ torch.cat([slopes, of_actions], dim=-1)
-    F[..., :d] -= torch.eye(d).to(F)
-    f = (successor - windows[:, :d]) @ white.T - (F @ x_mean.mT).squeeze(-1)
-    one = samples.live.unsqueeze(-1)
-    residual = (samples.y - samples.x @ F.mT - f.unsqueeze(1)) * one
-    import os
-    if os.environ.get("OFFSET", "1") == "1":
-        bias = residual.sum(dim=1, keepdim=True) / samples.counts[:, None, None]
-        f = f + bias[:, 0]
-        residual = (residual - bias) * one
-    degrees = d + 2
+    of_windows, of_actions = network.slopes(
+        (states - basis.b) @ inverse.T, x_mean[:, 0, len(basis.b) :]
+    )
+    F = white @ torch.cat([of_windows @ inverse, of_actions], dim=-1)
+    F[..., :d] -= torch.eye(d).to(F)  # increments of the newest block
+    f = (y_mean - x_mean @ F.mT)[:, 0]
+    residual = (samples.y - samples.x @ F.mT - f.unsqueeze(1)) * samples.live.unsqueeze(-1)
+    degrees = d + 2.0
     weak = degrees * settings.ridge**2 * torch.eye(d).to(F)
     Sigma = (residual.mT @ residual + weak) / (samples.counts + degrees)[:, None, None]
     return _increments(F, f, Sigma, samples)

@@ -1,5 +1,4 @@
-"""The E2C-like ablation (section 6): Algorithm 1 on robust locally linear controllable embedding.
-"""
+"""The E2C-like ablation (section 6): Algorithm 1 on robust locally linear controllable embedding."""
 
 from __future__ import annotations
 
@@ -15,6 +14,7 @@ class Rce(Solar):
     def make_prior(self) -> Prior:
         """The transition network and the recognition network of its bound."""
         assert isinstance(self.settings, RceSettings)
+        streams = self.streams.under("transitions")
         return ControllableEmbedding(
-            self.settings.transition, self.latent, self.task, self.device
+            self.settings.transition, self.latent, self.task, streams, self.device
         )

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -25,9 +25,33 @@ from solar_cli.models.priors import Segments, regressors
 from solar_cli.models.transition import Local, TransitionNetwork, perceptron
 from solar_cli.settings import TaskSettings
 from solar_cli.settings.local import Transition
+from solar_cli.streams import Streams
 
 
 LOG_TWO_PI = math.log(2 * math.pi)
+
+
+class Transitions(NamedTuple):
+    """Those of segments: the encoder's Gaussians before and after. Axes: n transitions."""
+
+    windows: Float[Tensor, "n Wd"]
+    """means, the newest frame first"""
+    now: Local
+    std: Float[Tensor, "n d"]
+    """of now.z"""
+    later: Float[Tensor, "n d"]
+    later_std: Float[Tensor, "n d"]
+
+    def of(self, rows: Tensor) -> Transitions:
+        """Some of them."""
+        now = Local(*(part[rows] for part in self.now))
+        return self._replace(
+            windows=self.windows[rows],
+            now=now,
+            std=self.std[rows],
+            later=self.later[rows],
+            later_std=self.later_std[rows],
+        )
 
 
 class ControllableEmbedding:
@@ -36,8 +60,16 @@ class ControllableEmbedding:
     factor = None
 
     def __init__(
-        self, settings: Transition, latent: int, task: TaskSettings, device: str
+        self,
+        settings: Transition,
+        latent: int,
+        task: TaskSettings,
+        streams: Streams,
+        device: str,
     ) -> None:
+        self.settings = settings
+        self.streams = streams
+        self.concluded = 0
         self.window = window = task.observation.window
         self.transition = TransitionNetwork(
             settings, latent, window, task.action.size, task.exploration.std
@@ -56,21 +88,17 @@ class ControllableEmbedding:
 
     def kl(self, statistics: Segments) -> Tensor:
         """The bound's terms but for the reconstruction, negative, nats a transition."""
-        mean, variance, noise = statistics.mean, statistics.variance, statistics.noise
-        assert noise is not None
-        now, later = slice(self.window - 1, -1), slice(self.window, None)
-        std = variance.sqrt()
-        successor = (mean + std * noise)[:, later]
+        assert statistics.noise is not None
         # The noise of a frame's sample serves twice: for z^ of the transition to it, and for zbar
         # of the one from it. No term has both.
-        terms = self.terms(
-            self._moves(statistics),
-            std[:, now].flatten(0, 1),
-            successor.flatten(0, 1),
-            noise[:, now].flatten(0, 1),
-        ).view(successor.shape[:2])
-        entropy = 0.5 * (variance[:, later].log() + 1 + LOG_TWO_PI).sum(dim=-1)
-        return statistics.counted(terms - entropy).mean()
+        noise = statistics.noise[:, self.window - 1 :]
+        now, later = (statistics.counted(part) for part in (noise[:, :-1], noise[:, 1:]))
+        return self._negative_bound(self._transitions(statistics), now, later)
+
+    def _negative_bound(self, given: Transitions, now: Tensor, later: Tensor) -> Tensor:
+        terms = self.terms(given.now, given.std, given.later + given.later_std * later, now)
+        entropy = (given.later_std.log() + 0.5 * (1 + LOG_TWO_PI)).sum(dim=-1)
+        return (terms - entropy).mean()
 
     def terms(
         self,
@@ -95,52 +123,70 @@ class ControllableEmbedding:
         density = -0.5 * (((z - now.z) / std).square() + 2 * std.log() + LOG_TWO_PI).sum(dim=-1)
         return kl - density + local.A.log_determinant()
 
-    def _moves(self, segments: Segments) -> Local:
-        """What there is at each transition, by the encoder's mean."""
-        actions = segments.actions[:, self.window - 1 :].flatten(0, 1)
-        return Local.of(self._windows(segments).flatten(0, 1), segments.mean.shape[-1], actions)
+    def _transitions(self, segments: Segments) -> Transitions:
+        """All that count."""
+        d, start = segments.mean.shape[-1], self.window - 1
+        windows = regressors(segments.mean, self.window)[:, :-1]
+        std = segments.variance[:, start:].sqrt()
+        parts = windows, segments.actions[:, start:], std[:, :-1], std[:, 1:]
+        counted = [segments.counted(part) for part in (*parts, segments.mean[:, start + 1 :])]
+        windows, actions, now_std, later_std, later = counted
+        return Transitions(windows, Local.of(windows, d, actions), now_std, later, later_std)
 
-    def _windows(self, segments: Segments) -> Float[Tensor, "S n Wd"]:
-        """Of each transition's present."""
-        return regressors(segments.mean, self.window)[:, :-1]
-
+    @torch.no_grad()
     def learn(self, statistics: Segments, scale: float) -> None:
         """Adam trains the networks; their units follow the latents."""
-        variance = statistics.counted(statistics.variance).mean(dim=0)
-        self.transition.track(self._moves(statistics), variance)
+        given = self._transitions(statistics)
+        self.transition.track(given.now, given.std.square().mean(dim=0))
 
     def conclude(self, episodes: Segments) -> None:
-        """Nothing in closed form."""
+        """Fit both networks further to all ``episodes``, with latents as they are."""
+        settings, given = self.settings, self._transitions(episodes)
+        optimiser = torch.optim.Adam(self.parameters(), lr=settings.rate)
+        count, d = given.later.shape
+        for step in range(settings.steps):
+            for group in optimiser.param_groups:
+                group["lr"] = settings.rate * 0.5 * (1 + math.cos(math.pi * step / settings.steps))
+            stream = self.streams.generator("conclusion", self.concluded, step)
+            rows = torch.from_numpy(stream.integers(count, size=settings.batch)).to(
+                given.later.device
+            )
+            noise = torch.from_numpy(stream.standard_normal((2, len(rows), d))).to(given.later)
+            loss = self._negative_bound(given.of(rows), *noise)
+            optimiser.zero_grad()
+            torch.autograd.backward(loss)
+            optimiser.step()
+        self.concluded += 1
 
     def given(self, episodes: Segments) -> None:
         """No factor over dynamics."""
 
+    @torch.no_grad()
     def judged(self, statistics: Segments) -> dict[str, float]:
         """R2 of the next latents less the present ones, both by the encoder's mean."""
-        windows = self._windows(statistics)
-        actions = statistics.actions[:, self.window - 1 :]
-        predicted = self.transition(windows.flatten(0, 1), actions.flatten(0, 1))
-        mean = statistics.mean[:, self.window - 1 :]
-        left = statistics.counted(predicted.view_as(mean[:, 1:]) - mean[:, 1:])
-        moved = statistics.counted(mean.diff(dim=1))
-        spread = (moved - moved.mean(dim=0)).square().sum()
-        return {"transition_r2": 1 - float(left.square().sum() / spread.clamp_min(1e-12))}
+        given = self._transitions(statistics)
+        predicted = self.transition(given.windows, given.now.u)
+        moved = given.later - given.now.z
+        spread = (moved - moved.mean(dim=0)).square().sum().clamp_min(1e-12)
+        return {"transition_r2": 1 - float((predicted - given.later).square().sum() / spread)}
 
     def metrics(self) -> dict[str, float]:
         """Nothing that is not a metric of training."""
         return {}
 
     def state_dict(self) -> dict[str, Any]:
-        """Weights of both networks, and the units."""
-        return {
+        """Weights of both networks, the units, and how often they were fitted."""
+        weights = {
             name: {key: value.detach().clone() for key, value in network.state_dict().items()}
             for name, network in self._networks().items()
         }
+        return {**weights, "concluded": self.concluded}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take them up."""
         for name, network in self._networks().items():
             network.load_state_dict(state[name])
+        self.concluded = state["concluded"]
 
     def _networks(self) -> dict[str, nn.Module]:
         return {"transition": self.transition, "recognition": self.recognition}

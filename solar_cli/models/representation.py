@@ -216,7 +216,9 @@ class Representation:
         draws = self._streams.generator("judging").standard_normal(mean[some].shape)
         sample = mean[some] + variance[some].sqrt() * torch.from_numpy(draws).to(mean)
         reconstruction = model.networks.reconstruction_loss(sample.float(), scaled)
-        noise = self._streams.generator("judging", "transitions").standard_normal(segments.mean.shape)
+        noise = self._streams.generator("judging", "transitions").standard_normal(
+            segments.mean.shape
+        )
         segments = segments._replace(noise=torch.from_numpy(noise).to(mean))
         statistics = model.prior.statistics(segments)
         kl = model.prior.kl(statistics)
@@ -276,9 +278,7 @@ class Representation:
             torch.manual_seed(self._streams.seed63("weights", attempt))
             networks = FrameModel(self.settings.representation, self.task.observation)
             prior = self._make_prior()
-        return LatentModel(
-            networks.to(self.device), prior, self.settings.training.standard_normal
-        )
+        return LatentModel(networks.to(self.device), prior, self.settings.training.standard_normal)
 
     def _posterior(self, batches: list[Episodes]) -> Segments:
         """q(z | s) of whole episodes; the same networks encode no collected frame twice."""

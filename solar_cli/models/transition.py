@@ -96,12 +96,12 @@ class TransitionNetwork(nn.Module):
         outputs = sum(torch.Size(shape).numel() for shape in self.shapes)
         self.layers = perceptron(latent + differences, settings.hidden, outputs, SMALL)
         for name, value in {
-            "mean": torch.zeros(latent),
-            "std": torch.ones(latent),
-            "difference_std": torch.ones(differences),
-            "action_std": torch.full((), action_std),
+            "mean": torch.zeros(latent, dtype=torch.float64),
+            "std": torch.ones(latent, dtype=torch.float64),
+            "difference_std": torch.ones(differences, dtype=torch.float64),
+            "action_std": torch.tensor(action_std, dtype=torch.float64),
         }.items():
-            self.register_buffer(name, value.double())
+            self.register_buffer(name, value)
         self.register_buffer("seen", torch.zeros((), dtype=torch.long))
 
     @torch.no_grad()
@@ -132,7 +132,8 @@ class TransitionNetwork(nn.Module):
         sizes = [torch.Size(shape).numel() for shape in self.shapes]
         parts = self.layers(torch.cat([place.z, place.e], dim=-1)).split(sizes, dim=-1)
         v, r, C, B, o = (
-            part.reshape(len(place.z), *shape) for part, shape in zip(parts, self.shapes, strict=True)
+            part.reshape(len(place.z), *shape)
+            for part, shape in zip(parts, self.shapes, strict=True)
         )
         return Coefficients(RankOne(v, r), C, B, o)
 
@@ -144,24 +145,21 @@ class TransitionNetwork(nn.Module):
         return self.plain(self.at(now).forward(now))
 
     @torch.no_grad()
-    def linearised(
+    def slopes(
         self, windows: Float[Tensor, "n Wd"], actions: Float[Tensor, "n a"]
-    ) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d Wd"], Float[Tensor, "n d a"]]:
-        """The next latents, as encoded, and their derivatives by window and by action."""
-        import os
-        if os.environ.get("JAC", "total") == "total":
-            def step(window: Tensor, action: Tensor) -> Tensor:
-                after: Tensor = self(window[None], action[None])[0]
-                return after
-        else:
-            def step(window, action):
-                now = self.in_units(Local.of(window[None], len(self.mean), action[None]))
-                at = Local(*(p.detach() for p in now))
-                return self.plain(self.at(at).forward(now))[0]
+    ) -> tuple[Float[Tensor, "n d Wd"], Float[Tensor, "n d a"]]:
+        """Derivatives of the next latents by windows and by actions.
 
-        jacobian = torch.func.jacrev(step, argnums=(0, 1))
+        The whole ones: that A, B, C and o are others nearby counts too.
+        """
+
+        def after(window: Tensor, action: Tensor) -> Tensor:
+            successor: Tensor = self(window.unsqueeze(0), action.unsqueeze(0))
+            return successor.squeeze(0)
+
+        jacobian = torch.func.jacrev(after, argnums=(0, 1))
         of_windows, of_actions = torch.func.vmap(jacobian)(windows, actions)
-        return self(windows, actions), of_windows, of_actions
+        return of_windows, of_actions
 
 
 def perceptron(inputs: int, hidden: tuple[int, ...], outputs: int, last: float) -> nn.Sequential:

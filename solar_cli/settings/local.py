@@ -86,6 +86,11 @@ class Transition(Settings):
     recognition: tuple[Annotated[int, Field(ge=1)], ...] = setting(
         (100,), "rectified layers of q(zbar | x, z'): the place of the linearisation"
     )
+    steps: int = setting(
+        300, "gradient steps of these networks after a training and in every iteration", ge=0
+    )
+    batch: int = setting(256, "transitions of such a step", ge=1)
+    rate: float = setting(1e-3, "Adam, in such steps; it falls to 0", gt=0)
 
 
 class Training(Settings):

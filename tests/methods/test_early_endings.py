@@ -9,7 +9,7 @@ from method_runs import Run
 
 from solar_cli.methods import solar
 
-both = pytest.mark.parametrize("name", ["solar", "vae"])
+both = pytest.mark.parametrize("name", ["solar", "vae", "rce"])
 
 
 class Ending:

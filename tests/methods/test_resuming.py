@@ -19,8 +19,17 @@ FLOORS = ("update.early_updates=1", "update.std_floor=[0.95, 0.3]", "update.kl_s
         ("solar", ("training.attempts=2", *FLOORS), 2 * 3),
         ("solar", ('dynamics.factors="varying"', 'dynamics.rows="all"'), 3),
         ("vae", FINE_TUNING, 3 + 2 + 2),
+        ("rce", FINE_TUNING, 3 + 2 + 2),
+        ("rce", ("training.attempts=2",), 2 * 3),
     ],
-    ids=["solar fine-tuned", "solar frozen, two attempts", "solar as in Eq. 5", "vae fine-tuned"],
+    ids=[
+        "solar fine-tuned",
+        "solar frozen, two attempts",
+        "solar as in Eq. 5",
+        "vae fine-tuned",
+        "rce fine-tuned",
+        "rce frozen, two attempts",
+    ],
 )
 def test_a_run_interrupted_at_any_pulse_ends_with_the_same_bits(tmp_path, name, sets, pulses):
     last, saved = 3, []
@@ -38,7 +47,7 @@ def test_a_run_interrupted_at_any_pulse_ends_with_the_same_bits(tmp_path, name, 
         assert resumed.bits() == whole.bits()
 
 
-@pytest.mark.parametrize("name", ["solar", "vae"])
+@pytest.mark.parametrize("name", ["solar", "vae", "rce"])
 @pytest.mark.parametrize("noise_free", [0, 2])
 def test_a_run_interrupted_while_it_collects_ends_with_the_same_bits(tmp_path, name, noise_free):
     """With episodes that judge, the third iteration is rejected: the best collects again."""
@@ -65,7 +74,7 @@ def test_a_run_interrupted_while_it_collects_ends_with_the_same_bits(tmp_path, n
         assert resumed.bits() == whole.bits()
 
 
-@pytest.mark.parametrize("name", ["solar", "vae"])
+@pytest.mark.parametrize("name", ["solar", "vae", "rce"])
 def test_a_run_interrupted_between_iterations_ends_with_the_same_bits(tmp_path, name):
     whole = Run(tmp_path / "whole", name, *FLOORS)
     parts = Run(tmp_path / "parts", name, *FLOORS).iterate(1, 1)
@@ -86,7 +95,7 @@ def test_an_iteration_that_is_repeated_gives_the_same_bits(tmp_path):
     assert again.bits() == once.bits()
 
 
-@pytest.mark.parametrize("name", ["solar", "vae"])
+@pytest.mark.parametrize("name", ["solar", "vae", "rce"])
 def test_a_cell_has_its_bits(tmp_path, name):
     runs = [Run(tmp_path / str(i), name, seed=i // 2).iterate(1, 2) for i in range(3)]
     assert runs[0].bits() == runs[1].bits()

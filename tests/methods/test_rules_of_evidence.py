@@ -25,7 +25,7 @@ class Blind:
         raise RuntimeError("not for learners")
 
 
-@pytest.mark.parametrize("name", ["solar", "vae"])
+@pytest.mark.parametrize("name", ["solar", "vae", "rce"])
 def test_evaluating_never_once_or_ten_times_gives_the_same_policies(tmp_path, name):
     found = set()
     for times in (0, 1, 10):
@@ -44,7 +44,7 @@ def test_evaluating_never_once_or_ten_times_gives_the_same_policies(tmp_path, na
 
 
 @pytest.mark.filterwarnings("ignore:ground truth is missing")
-@pytest.mark.parametrize("name", ["solar", "vae"])
+@pytest.mark.parametrize("name", ["solar", "vae", "rce"])
 def test_measures_are_out_of_a_learners_reach(tmp_path, name):
     seeing = Run(tmp_path / "seeing", name).iterate(1, 2)
     blind = Run(tmp_path / "blind", name, wrap=Blind).iterate(1, 2)
