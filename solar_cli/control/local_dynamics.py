@@ -75,20 +75,22 @@ def infer_dynamics(
     samples = newest.transitions(prior.latent)
     past = [batch.transitions(prior.latent) for batch in older]
     metrics: dict[str, float] = {}
+    fit: Fit
     if settings.method == "posterior":
         sources = _sources(samples, past, prior, settings)
         grid = _grid(sources, settings)
         scores = [_held_out(partial(_posterior, sources, s), samples, settings.folds) for s in grid]
         best = max(range(len(grid)), key=lambda i: scores[i].log_likelihood)
-        fit: Fit = partial(_posterior, sources, grid[best])
+        fit = partial(_posterior, sources, grid[best])
         score = scores[best]
         metrics = {f"prior_{name}": value for name, value in grid[best]._asdict().items()}
     else:
-        fit = {
+        fits: dict[str, Fit] = {
             "regression": _regression,
             "gmm": partial(_mixture_prior, past, streams),
             "network": partial(_linearised, prior, settings),
-        }[settings.method]
+        }
+        fit = fits[settings.method]
         score = _held_out(fit, samples, settings.folds)
     metrics |= {"one_step_log_likelihood": score.log_likelihood, "one_step_r2": score.r2}
     return LocalDynamics(_whole(fit(samples), newest, prior), metrics)

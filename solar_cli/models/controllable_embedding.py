@@ -1,8 +1,8 @@
 """Robust locally linear controllable embedding (Banijamali et al. 2018) as a prior over latents.
 
 The model of a transition: z, zbar ~ p(. | x), the encoder's Gaussian N(mu, diag sigma^2); the next
-latents are z^ = A(zbar) z + C(zbar) e + B(zbar) u + o(zbar), and x' ~ p(x' | z^). With the recognition
-q(z^ | x') q(zbar | x, z^), and z by the deterministic reverse transition, its bound is
+latents are z^ = A(zbar) z + C(zbar) e + B(zbar) u + o(zbar), and x' ~ p(x' | z^). With recognition
+by q(z^ | x') q(zbar | x, z^), and z by the deterministic reverse transition, its bound is
 
     log p(x' | x, u) >= E log p(x' | z^) + H(q(z^ | x')) - E KL(q(zbar | x, z^) || p(zbar | x))
                         + E[log p(z | x) - log |det A(zbar)|],    z = A^-1 (z^ - C e - B u - o).
@@ -23,10 +23,10 @@ from torch import Tensor, nn
 
 from solar_cli.models.priors import Segments, regressors
 from solar_cli.models.transition import Local, TransitionNetwork, perceptron
+from solar_cli.pulse import Diverged
 from solar_cli.settings import TaskSettings
 from solar_cli.settings.local import Transition
 from solar_cli.streams import Streams
-
 
 LOG_TWO_PI = math.log(2 * math.pi)
 
@@ -35,23 +35,22 @@ class Transitions(NamedTuple):
     """Those of segments: the encoder's Gaussians before and after. Axes: n transitions."""
 
     windows: Float[Tensor, "n Wd"]
-    """means, the newest frame first"""
-    now: Local
+    """means, of the newest frame first"""
+    actions: Float[Tensor, "n a"]
     std: Float[Tensor, "n d"]
-    """of now.z"""
+    """of the newest frame's"""
     later: Float[Tensor, "n d"]
+    """means of the next frame's"""
     later_std: Float[Tensor, "n d"]
+
+    @property
+    def now(self) -> Local:
+        """Where they start from, by the means."""
+        return Local.of(self.windows, self.later.shape[-1], self.actions)
 
     def of(self, rows: Tensor) -> Transitions:
         """Some of them."""
-        now = Local(*(part[rows] for part in self.now))
-        return self._replace(
-            windows=self.windows[rows],
-            now=now,
-            std=self.std[rows],
-            later=self.later[rows],
-            later_std=self.later_std[rows],
-        )
+        return Transitions(*(part[rows] for part in self))
 
 
 class ControllableEmbedding:
@@ -98,7 +97,8 @@ class ControllableEmbedding:
     def _negative_bound(self, given: Transitions, now: Tensor, later: Tensor) -> Tensor:
         terms = self.terms(given.now, given.std, given.later + given.later_std * later, now)
         entropy = (given.later_std.log() + 0.5 * (1 + LOG_TWO_PI)).sum(dim=-1)
-        return (terms - entropy).mean()
+        bound: Tensor = (terms - entropy).mean()
+        return bound
 
     def terms(
         self,
@@ -107,7 +107,7 @@ class ControllableEmbedding:
         successor: Float[Tensor, "n d"],
         noise: Float[Tensor, "n d"],
     ) -> Float[Tensor, " n"]:
-        """KL(q(zbar | x, z^) || p(zbar | x)) - log p(z | x) + log |det A| for samples z^ = successor.
+        """KL(q(zbar | x, z^) || p(zbar | x)) - log p(z | x) + log |det A|, for a ``successor`` z^.
 
         p(. | x) is N(now.z, diag std^2); ``noise`` is standard normal, for the sample of zbar.
         """
@@ -121,17 +121,18 @@ class ControllableEmbedding:
         local = network.at(place._replace(z=zbar))
         z = network.plain(local.backward(scaled, place))
         density = -0.5 * (((z - now.z) / std).square() + 2 * std.log() + LOG_TWO_PI).sum(dim=-1)
-        return kl - density + local.A.log_determinant()
+        terms: Tensor = kl - density + local.A.log_determinant()
+        return terms
 
     def _transitions(self, segments: Segments) -> Transitions:
         """All that count."""
-        d, start = segments.mean.shape[-1], self.window - 1
         windows = regressors(segments.mean, self.window)[:, :-1]
-        std = segments.variance[:, start:].sqrt()
-        parts = windows, segments.actions[:, start:], std[:, :-1], std[:, 1:]
-        counted = [segments.counted(part) for part in (*parts, segments.mean[:, start + 1 :])]
-        windows, actions, now_std, later_std, later = counted
-        return Transitions(windows, Local.of(windows, d, actions), now_std, later, later_std)
+        mean, std = (
+            part[:, self.window - 1 :] for part in (segments.mean, segments.variance.sqrt())
+        )
+        actions = segments.actions[:, self.window - 1 :]
+        parts = windows, actions, std[:, :-1], mean[:, 1:], std[:, 1:]
+        return Transitions(*(segments.counted(part) for part in parts))
 
     @torch.no_grad()
     def learn(self, statistics: Segments, scale: float) -> None:
@@ -143,19 +144,19 @@ class ControllableEmbedding:
         """Fit both networks further to all ``episodes``, with latents as they are."""
         settings, given = self.settings, self._transitions(episodes)
         optimiser = torch.optim.Adam(self.parameters(), lr=settings.rate)
-        count, d = given.later.shape
         for step in range(settings.steps):
             for group in optimiser.param_groups:
                 group["lr"] = settings.rate * 0.5 * (1 + math.cos(math.pi * step / settings.steps))
             stream = self.streams.generator("conclusion", self.concluded, step)
-            rows = torch.from_numpy(stream.integers(count, size=settings.batch)).to(
-                given.later.device
-            )
-            noise = torch.from_numpy(stream.standard_normal((2, len(rows), d))).to(given.later)
-            loss = self._negative_bound(given.of(rows), *noise)
+            rows = torch.from_numpy(stream.integers(len(given.later), size=settings.batch))
+            batch = given.of(rows.to(given.later.device))
+            noise = torch.from_numpy(stream.standard_normal((2, *batch.later.shape)))
+            loss = self._negative_bound(batch, *noise.to(given.later))
             optimiser.zero_grad()
             torch.autograd.backward(loss)
             optimiser.step()
+            if not math.isfinite(float(loss)):
+                raise Diverged(f"step {step + 1} of fitting transitions: the loss is not finite")
         self.concluded += 1
 
     def given(self, episodes: Segments) -> None:
@@ -165,7 +166,7 @@ class ControllableEmbedding:
     def judged(self, statistics: Segments) -> dict[str, float]:
         """R2 of the next latents less the present ones, both by the encoder's mean."""
         given = self._transitions(statistics)
-        predicted = self.transition(given.windows, given.now.u)
+        predicted = self.transition(given.windows, given.actions)
         moved = given.later - given.now.z
         spread = (moved - moved.mean(dim=0)).square().sum().clamp_min(1e-12)
         return {"transition_r2": 1 - float((predicted - given.later).square().sum() / spread)}

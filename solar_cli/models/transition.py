@@ -9,6 +9,7 @@ Axes: n samples, d latents of a frame, W frames of a window, r = (W - 1) d diffe
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -115,7 +116,7 @@ class TransitionNetwork(nn.Module):
         rate = (1 / self.seen).clamp_min(TRACKING).double()
         self.mean.lerp_(latents.z.mean(dim=0), rate)
         self.std.lerp_((latents.z.var(dim=0) + variance).sqrt(), rate)
-        differences = latents.e.unflatten(-1, (-1, len(variance))).square().mean(dim=0)
+        differences = latents.e.square().mean(dim=0).view(-1, len(variance))
         self.difference_std.lerp_((differences + variance).sqrt().flatten(), rate)
 
     def in_units(self, plain: Local) -> Local:
@@ -166,7 +167,7 @@ def perceptron(inputs: int, hidden: tuple[int, ...], outputs: int, last: float) 
     """Layers of rectified units, in float64; the last one's weights are scaled by ``last``."""
     widths = (inputs, *hidden)
     layers: list[nn.Module] = []
-    for before, after in zip(widths[:-1], widths[1:], strict=True):
+    for before, after in pairwise(widths):
         layers += [nn.Linear(before, after), nn.ReLU()]
     linear = nn.Linear(widths[-1], outputs)
     with torch.no_grad():

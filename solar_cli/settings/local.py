@@ -120,10 +120,8 @@ class Training(Settings):
 class LocalFit(Settings):
     """INFERDYNAMICS: where the prior of a time step's posterior comes from (section 4.1)."""
 
-    method: Literal["posterior", "regression", "gmm", "network"] = setting(
-        "posterior",
-        "posterior inference; least squares; a Gaussian-mixture prior (LQR-FLM); the model's own "
-        "transition network, linearised (rce)",
+    method: Literal["posterior", "regression", "gmm"] = setting(
+        "posterior", "posterior inference; least squares; a Gaussian-mixture prior (LQR-FLM)"
     )
     prior_counts: tuple[float, ...] | Literal["own"] = setting(
         (0.0, 1.0, 10.0, 100.0),
@@ -144,6 +142,14 @@ class LocalFit(Settings):
     folds: int = setting(3, "folds of the held-out likelihood", ge=2)
     ridge: float = setting(
         0.003, "noise of a latent, in units of its std, that slopes must bear", gt=0
+    )
+
+
+class NetworkFit(LocalFit):
+    """Where the model has a network of transitions, its slopes can be the dynamics' too."""
+
+    method: Literal["network", "regression", "gmm"] = setting(  # type: ignore[assignment]
+        "network", "slopes of the model's own network; least squares; a Gaussian-mixture prior"
     )
 
 
@@ -227,4 +233,4 @@ class Rce(LocalMethod):
     """RCE: a network of locally linear transitions is the prior and, linearised, the dynamics."""
 
     transition: Transition = setting(Transition(), "the model's own dynamics")
-    local_fit: LocalFit = setting(LocalFit(method="network"), "line 7 of Algorithm 1")
+    local_fit: NetworkFit = setting(NetworkFit(), "line 7 of Algorithm 1")

@@ -36,6 +36,8 @@ class MethodEntry:
     """kinds of observation it can learn from"""
     needs: Literal["costs", "true cost"] = "costs"
     """whether it sees the collected costs only, or the task's cost function"""
+    deviations: str = ""
+    """where it departs from its source, and why"""
 
 
 BUILT_IN = (
@@ -62,6 +64,12 @@ BUILT_IN = (
         source="Banijamali et al. 2018 (section 6, E2C-like ablation)",
         settings="solar_cli.settings.local:Rce",
         learner="solar_cli.methods.rce:Rce",
+        deviations="Frames are encoded one by one: where there is a window, A maps the newest "
+        "latents, and differences back through the window enter linearly, as the action does. The "
+        "network works in units of the latents' std. Likelihood, schedules and a small further KL "
+        "to N(0, I) are SOLAR's here, so that only the model differs. Where the encoder is frozen, "
+        "the transition network is fitted further in every iteration. Control is SOLAR's LQR on "
+        "its slopes, with offsets and noise from its errors, and not iLQR on its rollouts.",
     ),
     MethodEntry(
         name="mpc-nn",

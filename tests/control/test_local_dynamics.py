@@ -18,7 +18,7 @@ from solar_cli.inference import mniw
 from solar_cli.models.basis import LatentBasis
 from solar_cli.models.priors import LatentPrior
 from solar_cli.models.transition import TransitionNetwork
-from solar_cli.settings.local import LocalFit, Transition
+from solar_cli.settings.local import LocalFit, NetworkFit, Transition
 from solar_cli.streams import Streams
 
 d, a, T = 2, 2, 8
@@ -163,7 +163,7 @@ def test_a_network_that_is_right_gives_the_true_slopes_at_once(window):
     y, actions = system(episodes, seed=1)[:2]
     newest, _ = states(y, actions, window, basis)
     prior = LatentPrior(None, basis, d, exact_network(window))
-    found = infer_dynamics(newest, [], prior, LocalFit(method="network"), Streams(0))
+    found = infer_dynamics(newest, [], prior, NetworkFit(), Streams(0))
     filled = slice(window - 1, None)
     F, f, Sigma = (part[filled] for part in truth(window, SHEAR))
     np.testing.assert_allclose(found.model.F[filled], F, atol=1e-9)

@@ -9,7 +9,7 @@ from model_problems import made_up_segments, vector_task
 
 from solar_cli.models.controllable_embedding import ControllableEmbedding
 from solar_cli.models.priors import Segments
-from solar_cli.models.transition import Local, RankOne, TransitionNetwork
+from solar_cli.models.transition import Local, RankOne
 from solar_cli.settings.local import Transition
 from solar_cli.streams import Streams
 
