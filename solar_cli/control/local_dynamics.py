@@ -75,17 +75,22 @@ def infer_dynamics(
     samples = newest.transitions(prior.latent)
     past = [batch.transitions(prior.latent) for batch in older]
     metrics: dict[str, float] = {}
+    fit: Fit
     if settings.method == "posterior":
         sources = _sources(samples, past, prior, settings)
         grid = _grid(sources, settings)
         scores = [_held_out(partial(_posterior, sources, s), samples, settings.folds) for s in grid]
         best = max(range(len(grid)), key=lambda i: scores[i].log_likelihood)
-        fit: Fit = partial(_posterior, sources, grid[best])
+        fit = partial(_posterior, sources, grid[best])
         score = scores[best]
         metrics = {f"prior_{name}": value for name, value in grid[best]._asdict().items()}
     else:
-        mixture = partial(_mixture_prior, past, streams)
-        fit = _regression if settings.method == "regression" else mixture
+        fits: dict[str, Fit] = {
+            "regression": _regression,
+            "gmm": partial(_mixture_prior, past, streams),
+            "network": partial(_linearised, prior, settings),
+        }
+        fit = fits[settings.method]
         score = _held_out(fit, samples, settings.folds)
     metrics |= {"one_step_log_likelihood": score.log_likelihood, "one_step_r2": score.r2}
     return LocalDynamics(_whole(fit(samples), newest, prior), metrics)
@@ -259,6 +264,30 @@ def _mixture_prior(
     points, live = torch.cat([samples.x, samples.y], dim=-1)[:sampled], samples.live[:sampled]
     joint = gmm.fit_joint(points, gmm.local_prior(fit.mixture, points, live), live)
     F, f, Sigma = gmm.condition_joint(joint, samples.x.shape[-1])
+    return _increments(F, f, Sigma, samples)
+
+
+def _linearised(prior: LatentPrior, settings: LocalFit, samples: Transitions) -> Increments:
+    """The slopes of the model's own network at the mean of every time step.
+
+    Its errors on these samples give the rest: their mean goes to the offset, as with every other
+    fit, and their spread is Sigma, with a weak prior for the few samples of a step.
+    """
+    network, basis, d = prior.transition, prior.basis, prior.latent
+    assert network is not None
+    x_mean, y_mean = samples.means()
+    states = x_mean[:, 0, : len(basis.b)]
+    inverse, white = torch.linalg.inv(basis.A), basis.A[:d, :d]
+    of_windows, of_actions = network.slopes(
+        (states - basis.b) @ inverse.T, x_mean[:, 0, len(basis.b) :]
+    )
+    F = white @ torch.cat([of_windows @ inverse, of_actions], dim=-1)
+    F[..., :d] -= torch.eye(d).to(F)  # increments of the newest block
+    f = (y_mean - x_mean @ F.mT)[:, 0]
+    residual = (samples.y - samples.x @ F.mT - f.unsqueeze(1)) * samples.live.unsqueeze(-1)
+    degrees = d + 2.0
+    weak = degrees * settings.ridge**2 * torch.eye(d).to(F)
+    Sigma = (residual.mT @ residual + weak) / (samples.counts + degrees)[:, None, None]
     return _increments(F, f, Sigma, samples)
 
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from solar_cli.episodes import Episodes
 from solar_cli.models.frames import CHUNK, FrameModel
@@ -31,12 +31,16 @@ class Minibatch(NamedTuple):
 
 
 class LatentModel:
-    """q(z | s), p(s | z) and the prior over z; ``networks`` holds what Adam trains."""
+    """q(z | s), p(s | z) and the prior over z."""
 
     def __init__(self, networks: FrameModel, prior: Prior, standard_normal: float) -> None:
         self.networks = networks
         self.prior = prior
         self.standard_normal = standard_normal
+
+    def parameters(self) -> list[nn.Parameter]:
+        """What Adam trains."""
+        return [*self.networks.parameters(), *self.prior.parameters()]
 
     def loss(self, batch: Minibatch, kl_weight: float) -> tuple[Tensor, Any, dict[str, Tensor]]:
         """The negative ELBO in nats a frame, what the prior learns from, and the ELBO's terms.
@@ -57,6 +61,7 @@ class LatentModel:
             batch.actions,
             batch.start,
             starts=batch.starts,
+            noise=batch.noise.double(),
         )
         statistics = self.prior.statistics(segments)
         kl = self.prior.kl(statistics)

@@ -6,15 +6,16 @@ p = W d + a + 1 regressors (the constant 1 gives the dynamics an affine term), T
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 
 from solar_cli.inference import mniw, niw
 from solar_cli.models.basis import LatentBasis
+from solar_cli.models.transition import TransitionNetwork
 from solar_cli.settings import TaskSettings
 from solar_cli.settings.local import Dynamics
 
@@ -35,6 +36,8 @@ class Segments(NamedTuple):
     """the frames that count, the first ones of each segment; None where all do"""
     starts: Int[Tensor, " S"] | None = None
     """starts that a segment of each one's episode can have; None for a whole episode's T + 2 - L"""
+    noise: Float[Tensor, "S L d"] | None = None
+    """standard normal draws of a sample of each factor; None where none is drawn"""
 
     def counted(self, part: Float[Tensor, "S n *rest"]) -> Float[Tensor, "k *rest"]:
         """Of one value a frame, or a transition to one of the last n frames: those that count."""
@@ -68,10 +71,19 @@ class LatentPrior(NamedTuple):
     basis: LatentBasis
     latent: int
     """d: entries of the newest block"""
+    transition: TransitionNetwork | None = None
+    """the network that its own dynamics are, or None for a representation without"""
 
 
 class Prior(Protocol):
     """What the representation is asked to look like."""
+
+    @property
+    def transition(self) -> TransitionNetwork | None:
+        """A network that predicts latents, or None for a prior without."""
+
+    def parameters(self) -> Iterable[nn.Parameter]:
+        """What Adam trains of it, beside the networks of frames."""
 
     @property
     def factor(self) -> mniw.RegressionStatistics | None:
@@ -92,6 +104,9 @@ class Prior(Protocol):
     def given(self, episodes: Segments) -> mniw.RegressionStatistics | None:
         """The factor given whole ``episodes`` alone; None for a prior without dynamics."""
 
+    def judged(self, statistics: Any) -> dict[str, float]:
+        """How well a network of its own does on segments that it was not trained on."""
+
     def metrics(self) -> dict[str, float]:
         """KL of the factors over parameters, in nats."""
 
@@ -106,6 +121,11 @@ class StandardNormal:
     """p(z_t) = N(0, I): the VAE ablation."""
 
     factor = None
+    transition = None
+
+    def parameters(self) -> tuple[()]:
+        """No networks."""
+        return ()
 
     def statistics(self, segments: Segments) -> Segments:
         """The segments as they are."""
@@ -124,6 +144,10 @@ class StandardNormal:
 
     def given(self, episodes: Segments) -> None:
         """No dynamics."""
+
+    def judged(self, statistics: Segments) -> dict[str, float]:
+        """No network to judge."""
+        return {}
 
     def metrics(self) -> dict[str, float]:
         """No parameters."""
@@ -170,6 +194,8 @@ class BayesianLDS:
     steps before W - 1 stay the prior.
     """
 
+    transition = None
+
     def __init__(
         self,
         settings: Dynamics,
@@ -206,6 +232,10 @@ class BayesianLDS:
             )
         )
         self.initial = self.initial_prior
+
+    def parameters(self) -> tuple[()]:
+        """No networks."""
+        return ()
 
     def statistics(self, segments: Segments) -> DynamicsStatistics:
         """Expected sufficient statistics, such that their mean over starts is an episode's."""
@@ -311,6 +341,10 @@ class BayesianLDS:
     def given(self, episodes: Segments) -> mniw.RegressionStatistics:
         """The exact posterior over (F, Sigma) given ``episodes`` alone."""
         return self.prior.plus(self.statistics(episodes).transitions)
+
+    def judged(self, statistics: DynamicsStatistics) -> dict[str, float]:
+        """No network to judge."""
+        return {}
 
     def metrics(self) -> dict[str, float]:
         """KL(q || p) of the factors over parameters: the last terms of the ELBO, in nats."""

@@ -7,6 +7,7 @@ most, and the best by held-out collected episodes is kept. Nothing here sees an 
 
 from __future__ import annotations
 
+import copy
 import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -106,7 +107,8 @@ class Representation:
         if factor is not None:
             factor = mniw.RegressionStatistics(*(part.cpu() for part in factor))
         basis = LatentBasis(*(part.cpu() for part in self.basis))
-        return LatentPrior(factor, basis, self.latent)
+        network = copy.deepcopy(self._model.prior.transition)
+        return LatentPrior(factor, basis, self.latent, None if network is None else network.cpu())
 
     @property
     def latent(self) -> int:
@@ -214,7 +216,12 @@ class Representation:
         draws = self._streams.generator("judging").standard_normal(mean[some].shape)
         sample = mean[some] + variance[some].sqrt() * torch.from_numpy(draws).to(mean)
         reconstruction = model.networks.reconstruction_loss(sample.float(), scaled)
-        kl = model.prior.kl(model.prior.statistics(segments))
+        noise = self._streams.generator("judging", "transitions").standard_normal(
+            segments.mean.shape
+        )
+        segments = segments._replace(noise=torch.from_numpy(noise).to(mean))
+        statistics = model.prior.statistics(segments)
+        kl = model.prior.kl(statistics)
         explained = explained_variance(model.networks.reconstruct(scaled), scaled)
         spread = mean.var(dim=0)
         carried = spread / (spread + variance.mean(dim=0))
@@ -223,6 +230,7 @@ class Representation:
             "held_out_kl": float(kl),
             "least_explained_variance": float(explained.min()),
             "active_latents": float((carried >= ACTIVE_SHARE).sum()),
+            **model.prior.judged(statistics),
         }
 
     @torch.no_grad()
@@ -269,9 +277,8 @@ class Representation:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self._streams.seed63("weights", attempt))
             networks = FrameModel(self.settings.representation, self.task.observation)
-        return LatentModel(
-            networks.to(self.device), self._make_prior(), self.settings.training.standard_normal
-        )
+            prior = self._make_prior()
+        return LatentModel(networks.to(self.device), prior, self.settings.training.standard_normal)
 
     def _posterior(self, batches: list[Episodes]) -> Segments:
         """q(z | s) of whole episodes; the same networks encode no collected frame twice."""

@@ -52,9 +52,7 @@ class Trainer:
         When fine-tuning, half of the segments come from the ``newest`` episodes, the last ones.
         """
         data, fine_tuning = Dataset(batches, self.device, newest), newest > 0
-        optimiser = torch.optim.Adam(
-            model.networks.parameters(), lr=self.settings.learning_rate, fused=True
-        )
+        optimiser = torch.optim.Adam(model.parameters(), lr=self.settings.learning_rate, fused=True)
         if self._running is None or self._running["name"] != name:
             self._running = {"name": name, "step": 0, "terms": {}, "seconds": 0.0}
         elif "optimiser" in self._running:
@@ -101,9 +99,7 @@ class Trainer:
         loss, statistics, terms = model.loss(batch, kl_weight)
         optimiser.zero_grad()
         torch.autograd.backward(loss)
-        torch.nn.utils.clip_grad_norm_(
-            model.networks.parameters(), self.settings.clip, foreach=True
-        )
+        torch.nn.utils.clip_grad_norm_(model.parameters(), self.settings.clip, foreach=True)
         optimiser.step()
         model.prior.learn(statistics, scale)
         return loss.detach(), terms

@@ -79,6 +79,22 @@ class Dynamics(Settings):
     )
 
 
+class Transition(Settings):
+    """RCE's networks of transitions: z' = A z + B u + o at every place, A = I + v r^T."""
+
+    hidden: tuple[Annotated[int, Field(ge=1)], ...] = setting(
+        (100, 100), "rectified layers of the network for A, B and o", "E2C"
+    )
+    recognition: tuple[Annotated[int, Field(ge=1)], ...] = setting(
+        (100,), "rectified layers of q(zbar | x, z'): the place of the linearisation"
+    )
+    steps: int = setting(
+        300, "gradient steps of these networks after a training and in every iteration", ge=0
+    )
+    batch: int = setting(256, "transitions of such a step", ge=1)
+    rate: float = setting(1e-3, "Adam, in such steps; it falls to 0", gt=0)
+
+
 class Training(Settings):
     """Stochastic maximisation of the ELBO (section 3)."""
 
@@ -128,6 +144,14 @@ class LocalFit(Settings):
     folds: int = setting(3, "folds of the held-out likelihood", ge=2)
     ridge: float = setting(
         0.003, "noise of a latent, in units of its std, that slopes must bear", gt=0
+    )
+
+
+class NetworkFit(LocalFit):
+    """Where the model has a network of transitions, its slopes can be the dynamics' too."""
+
+    method: Literal["network", "regression", "gmm"] = setting(  # type: ignore[assignment]
+        "network", "slopes of the model's own network; least squares; a Gaussian-mixture prior"
     )
 
 
@@ -221,6 +245,13 @@ class Vae(LocalMethod):
 
     training: Training = setting(Training(standard_normal=0.0), "line 5 of Algorithm 1")
     local_fit: LocalFit = setting(LocalFit(method="gmm"), "line 7 of Algorithm 1")
+
+
+class Rce(LocalMethod):
+    """RCE: a network of locally linear transitions is the prior and, linearised, the dynamics."""
+
+    transition: Transition = setting(Transition(), "the model's own dynamics")
+    local_fit: NetworkFit = setting(NetworkFit(), "line 7 of Algorithm 1")
 
 
 class LqrFlm(LocalControl):

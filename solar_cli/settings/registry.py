@@ -70,6 +70,20 @@ BUILT_IN = (
         "best policy, bounds of its noise, the step's adaptation.",
     ),
     MethodEntry(
+        name="rce",
+        summary="SOLAR with robust locally linear controllable embedding, an E2C, in place of the "
+        "structured model; local dynamics by linearising its transition network.",
+        source="Banijamali et al. 2018 (section 6, E2C-like ablation)",
+        settings="solar_cli.settings.local:Rce",
+        learner="solar_cli.methods.rce:Rce",
+        deviations="Frames are encoded one by one: where there is a window, A maps the newest "
+        "latents, and differences back through the window enter linearly, as the action does. The "
+        "network works in units of the latents' std. Likelihood, schedules and a small further KL "
+        "to N(0, I) are SOLAR's here, so that only the model differs. Where the encoder is frozen, "
+        "the transition network is fitted further in every iteration. Control is SOLAR's LQR on "
+        "its slopes, with offsets and noise from its errors, and not iLQR on its rollouts.",
+    ),
+    MethodEntry(
         name="mpc-nn",
         summary="Neural dynamics of states, and the best of random action sequences under them and "
         "the task's own cost.",

@@ -237,6 +237,23 @@ def test_methods_lists_the_methods_and_the_settings_of_one(solar: Solar) -> None
     assert "KL-constrained" in solar("methods").out
 
 
+def test_methods_says_where_one_departs_from_its_source_and_what_it_has_beyond(
+    solar: Solar,
+) -> None:
+    entries = {entry["name"]: entry for entry in json.loads(solar("methods", "--json").out)}
+    text = " ".join(solar("methods", "rce").out.split())
+    assert entries["rce"]["deviations"] in text
+    assert entries["rce"]["source"] in text
+    assert "learns from: image, state; needs: costs" in text
+    assert "restarts of dead representations (training.attempts = 3)" in text
+    off = "off unless a card says so: judging by episodes without noise (batches.noise_free = 0)"
+    assert off in text
+    assert "going back to the best policy" in entries["rce"]["extras"]
+    assert "judging by episodes without noise" not in entries["rce"]["extras"]
+    assert entries["random"]["extras"] == []
+    assert "extras on" not in solar("methods", "random").out
+
+
 def test_every_setting_of_a_card_can_be_set_by_the_path_that_tasks_prints(solar: Solar) -> None:
     """The first column of ``solar tasks NAME`` is what ``--set`` takes."""
     from solar_cli.cli.configuration import shown

@@ -4,7 +4,8 @@ Two systems: one whose latents say all (W = 1), and one whose velocity is hidden
 differences of a window of four latents.
 """
 
-from functools import cache
+import math
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -16,7 +17,8 @@ from solar_cli.control.trajectories import Trajectories
 from solar_cli.inference import gmm, mniw
 from solar_cli.models.basis import LatentBasis
 from solar_cli.models.priors import LatentPrior
-from solar_cli.settings.local import LocalFit
+from solar_cli.models.transition import TransitionNetwork
+from solar_cli.settings.local import LocalFit, NetworkFit, Transition
 from solar_cli.streams import Streams
 
 d, a, T = 2, 2, 8
@@ -29,10 +31,13 @@ def only_data(**changes) -> LocalFit:
     return LocalFit.model_validate(none | {"widths": (1.0,), **changes})
 
 
-def first_order(episodes, seed=0, horizon=T, varying=0.0):
+FIRST_ORDER = np.array([[0.9, 0.2], [-0.3, 0.8]])
+
+
+def first_order(episodes, seed=0, horizon=T, varying=0.0, M=FIRST_ORDER):
     """y' = M_t y + B a + c + noise: latents (N, T+1, d), actions, and M, B, c."""
     rng, fixed = np.random.default_rng(seed), np.random.default_rng(100)
-    M = np.array([[0.9, 0.2], [-0.3, 0.8]]) + varying * fixed.normal(size=(horizon, d, d))
+    M = M + varying * fixed.normal(size=(horizon, d, d))
     B, c = np.array([[0.5, 0.1], [0.0, 0.4]]), np.array([0.3, -0.1])
     actions = rng.normal(0, 0.4, (episodes, horizon, a))
     y = np.empty((episodes, horizon + 1, d))
@@ -82,13 +87,13 @@ def true_basis(window) -> LatentBasis:
     return LatentBasis.whitening(windows(y, window).flatten(0, 1))
 
 
-def truth(window):
+def truth(window, M=FIRST_ORDER):
     """F, f, Sigma (T, ...) in the states of `true_basis`, by algebra on windows."""
     A, b = (part.numpy() for part in true_basis(window))
     size = window * d
     shift, enter = np.eye(size, k=-d), np.eye(size, d)
     if window == 1:
-        _, _, M, B, c = first_order(1)
+        _, _, M, B, c = first_order(1, M=M)
     else:
         _, _, B = second_order(1)
         M = np.tile(
@@ -117,6 +122,55 @@ def errors(window, episodes, settings, seed=1):
 
 
 # The truth
+
+
+SHEAR = np.array([[0.9, 0.2], [0.1, 0.8]])
+"""I + v r^T, as RCE's network has it."""
+
+
+def exact_network(window) -> TransitionNetwork:
+    """A network that gives the system's transitions at every place, in units of its own."""
+    network = TransitionNetwork(Transition(hidden=(3,)), d, window, a, action_std=0.4)
+    torch.manual_seed(0)
+    network.mean.normal_(), network.std.uniform_(0.5, 2.0), network.difference_std.uniform_(0.2, 1)
+    if window == 1:
+        _, _, _, B, c = first_order(1, M=SHEAR)
+        M, c = torch.as_tensor(SHEAR), torch.as_tensor(c)
+    else:
+        M, B, c = torch.eye(d).double(), second_order(1)[2], torch.zeros(d).double()
+    std, eye, last = network.std, torch.eye(d), network.layers[-1]
+    U, s, Vh = torch.linalg.svd((M - eye) * std / std[:, None])
+    assert s[1] < 1e-9
+    C = 0.8 * torch.eye(d, (window - 1) * d) * network.difference_std / std[:, None]
+    o = ((M - eye) @ network.mean + c) / std
+    parts = (
+        U[:, 0] * s[0],
+        Vh[0],
+        C.flatten(),
+        (torch.as_tensor(B) * 0.4 / std[:, None]).flatten(),
+    )
+    with torch.no_grad():
+        last.weight.zero_()
+        last.bias.copy_(torch.cat([*parts, o]))
+    return network
+
+
+@pytest.mark.parametrize("window", [1, 4])
+def test_a_network_that_is_right_gives_the_true_slopes_at_once(window):
+    """And their offset and noise as the samples of a time step show them."""
+    basis, episodes = true_basis(window), 400
+    system = partial(first_order, M=SHEAR) if window == 1 else second_order
+    y, actions = system(episodes, seed=1)[:2]
+    newest, _ = states(y, actions, window, basis)
+    prior = LatentPrior(None, basis, d, exact_network(window))
+    found = infer_dynamics(newest, [], prior, NetworkFit(), Streams(0))
+    filled = slice(window - 1, None)
+    F, f, Sigma = (part[filled] for part in truth(window, SHEAR))
+    np.testing.assert_allclose(found.model.F[filled], F, atol=1e-9)
+    error = NOISE * np.abs(basis.A.numpy()).max() / math.sqrt(episodes)
+    assert np.abs(found.model.f[filled].numpy() - f).max() < 5 * error
+    assert np.abs(found.model.Sigma[filled].numpy() - Sigma).max() < 0.25 * np.abs(Sigma).max()
+    assert found.metrics["one_step_r2"] > 0.9
 
 
 @pytest.mark.parametrize("window", [1, 4])

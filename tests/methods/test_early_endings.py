@@ -9,8 +9,8 @@ from method_runs import Run
 
 from solar_cli.methods import solar
 
-both = pytest.mark.parametrize("name", ["solar", "vae"])
-every = pytest.mark.parametrize("name", ["solar", "vae", "lqr-flm"])
+both = pytest.mark.parametrize("name", ["solar", "vae", "rce"])
+every = pytest.mark.parametrize("name", ["solar", "vae", "rce", "lqr-flm"])
 
 
 class Ending:

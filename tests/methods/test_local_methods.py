@@ -14,8 +14,8 @@ from solar_cli.episodes import Batch, Episodes, Evaluation, Experience, evaluate
 from solar_cli.methods import Diverged, local, solar
 from solar_cli.streams import Streams
 
-both = pytest.mark.parametrize("name", ["solar", "vae"])
-every = pytest.mark.parametrize("name", ["solar", "vae", "lqr-flm"])
+both = pytest.mark.parametrize("name", ["solar", "vae", "rce"])
+every = pytest.mark.parametrize("name", ["solar", "vae", "rce", "lqr-flm"])
 
 
 NOISE_FREE = "batches={ initial = 8, noisy = 5, noise_free = 3 }"
@@ -253,14 +253,17 @@ def test_a_policy_that_is_not_finite_is_divergence(tmp_path, monkeypatch):
 def test_only_solar_has_a_factor_over_dynamics(tmp_path):
     solar_run = Run(tmp_path / "solar", "solar").iterate(1, 1)
     vae_run = Run(tmp_path / "vae", "vae").iterate(1, 1)
-    for run, known in ((solar_run, True), (vae_run, False)):
+    rce_run = Run(tmp_path / "rce", "rce").iterate(1, 1)
+    for run, known in ((solar_run, True), (vae_run, False), (rce_run, False)):
         for own in (True, False):
             older = [collected_in(1, run.environment)]
             prior = run.learner.representation.dynamics_prior(older, as_it_stands=own)
             assert (prior.factor is not None) == known
+            assert (prior.transition is not None) == (run is rce_run)
     assert "kl_dynamics" in solar_run.metrics[0]
     assert "kl_dynamics" not in vae_run.metrics[0]
     assert vae_run.learner.settings.local_fit.method == "gmm"
+    assert rce_run.learner.settings.local_fit.method == "network"
 
 
 def test_time_varying_factors_have_one_a_time_step(tmp_path):

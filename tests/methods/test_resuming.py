@@ -19,8 +19,17 @@ FLOORS = ("update.early_updates=1", "update.std_floor=[0.95, 0.3]", "update.kl_s
         ("solar", ("training.attempts=2", *FLOORS), 2 * 3),
         ("solar", ('dynamics.factors="varying"', 'dynamics.rows="all"'), 3),
         ("vae", FINE_TUNING, 3 + 2 + 2),
+        ("rce", FINE_TUNING, 3 + 2 + 2),
+        ("rce", ("training.attempts=2",), 2 * 3),
     ],
-    ids=["solar fine-tuned", "solar frozen, two attempts", "solar as in Eq. 5", "vae fine-tuned"],
+    ids=[
+        "solar fine-tuned",
+        "solar frozen, two attempts",
+        "solar as in Eq. 5",
+        "vae fine-tuned",
+        "rce fine-tuned",
+        "rce frozen, two attempts",
+    ],
 )
 def test_a_run_interrupted_at_any_pulse_ends_with_the_same_bits(tmp_path, name, sets, pulses):
     last, saved = 3, []
@@ -39,7 +48,8 @@ def test_a_run_interrupted_at_any_pulse_ends_with_the_same_bits(tmp_path, name, 
 
 
 @pytest.mark.parametrize(
-    ("name", "sets"), [("solar", FINE_TUNING), ("vae", FINE_TUNING), ("lqr-flm", ())]
+    ("name", "sets"),
+    [("solar", FINE_TUNING), ("vae", FINE_TUNING), ("rce", FINE_TUNING), ("lqr-flm", ())],
 )
 @pytest.mark.parametrize("noise_free", [0, 2])
 def test_a_run_interrupted_while_it_collects_ends_with_the_same_bits(
@@ -69,7 +79,7 @@ def test_a_run_interrupted_while_it_collects_ends_with_the_same_bits(
         assert resumed.bits() == whole.bits()
 
 
-@pytest.mark.parametrize("name", ["solar", "vae", "lqr-flm"])
+@pytest.mark.parametrize("name", ["solar", "vae", "rce", "lqr-flm"])
 def test_a_run_interrupted_between_iterations_ends_with_the_same_bits(tmp_path, name):
     whole = Run(tmp_path / "whole", name, *FLOORS)
     parts = Run(tmp_path / "parts", name, *FLOORS).iterate(1, 1)
@@ -90,7 +100,7 @@ def test_an_iteration_that_is_repeated_gives_the_same_bits(tmp_path):
     assert again.bits() == once.bits()
 
 
-@pytest.mark.parametrize("name", ["solar", "vae", "lqr-flm"])
+@pytest.mark.parametrize("name", ["solar", "vae", "rce", "lqr-flm"])
 def test_a_cell_has_its_bits(tmp_path, name):
     runs = [Run(tmp_path / str(i), name, seed=i // 2).iterate(1, 2) for i in range(3)]
     assert runs[0].bits() == runs[1].bits()

@@ -30,6 +30,7 @@ class Blind:
     [
         ("solar", ["training.fine_tune_steps=4"]),
         ("vae", ["training.fine_tune_steps=4"]),
+        ("rce", ["training.fine_tune_steps=4"]),
         ("lqr-flm", []),
     ],
 )
@@ -51,7 +52,7 @@ def test_evaluating_never_once_or_ten_times_gives_the_same_policies(tmp_path, na
 
 
 @pytest.mark.filterwarnings("ignore:ground truth is missing")
-@pytest.mark.parametrize("name", ["solar", "vae", "lqr-flm"])
+@pytest.mark.parametrize("name", ["solar", "vae", "rce", "lqr-flm"])
 def test_measures_are_out_of_a_learners_reach(tmp_path, name):
     seeing = Run(tmp_path / "seeing", name).iterate(1, 2)
     blind = Run(tmp_path / "blind", name, wrap=Blind).iterate(1, 2)
