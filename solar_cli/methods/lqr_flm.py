@@ -6,8 +6,9 @@ Gaussian mixture over all transitions is the prior of each time step's normal-in
 
 Where ours departs from the authors' release (guided policy search): the cost is not given but
 fitted, as section E.2 has it; images, of which their fit cannot even be stored, are seen by their
-principal components; and the rules around an update are those of all local methods here, going
-back to the best policy among them. Its other numbers are theirs.
+principal components; states are whitened, so that ridges have no units; and the KL step, the
+bounds of noise and the way back to the best policy are those of all local methods here. The
+mixture's numbers are theirs.
 """
 
 from __future__ import annotations

@@ -260,7 +260,9 @@ class LqrFlm(LocalControl):
     components: int = setting(
         20, "principal components of an image; an observed state is taken whole", ge=1, le=50
     )
-    local_fit: LocalFit = setting(LocalFit(method="gmm"), "line 7 of Algorithm 1")
+    local_fit: LocalFit = setting(
+        LocalFit(method="gmm"), "line 7 of Algorithm 1", "Levine and Abbeel 2014"
+    )
 
     def latents(self, observation: Observation) -> int:
         """Entries of an observed state, or principal components of an image."""

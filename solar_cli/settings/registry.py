@@ -66,8 +66,8 @@ BUILT_IN = (
         learner="solar_cli.methods.lqr_flm:LqrFlm",
         deviations="Images are seen by their principal components in the first batch: a linear "
         "model of all pixels at each time step fits no memory. The cost is fitted to collected "
-        "costs, as App. E.2 has it. The rules around an update are SOLAR's here: going back to the "
-        "best policy, bounds of its noise, the step's adaptation.",
+        "costs, as App. E.2 has it. States are whitened. The rules around an update are SOLAR's "
+        "here: the KL step and its adaptation, going back to the best policy, bounds of its noise.",
     ),
     MethodEntry(
         name="rce",
