@@ -155,7 +155,7 @@ class ControllableEmbedding:
             optimiser.zero_grad()
             torch.autograd.backward(loss)
             optimiser.step()
-            if not math.isfinite(float(loss)):
+            if not math.isfinite(loss.item()):
                 raise Diverged(f"step {step + 1} of fitting transitions: the loss is not finite")
         self.concluded += 1
 

@@ -316,6 +316,6 @@ def test_latents_that_follow_the_dynamics_cost_less_than_others_once_it_has_lear
         prior.kl(segments).backward()
         adam.step()
     shuffled = segments._replace(actions=segments.actions.flip(0))
-    assert float(prior.kl(segments)) < 0.5
-    assert float(prior.kl(shuffled)) > float(prior.kl(segments)) + 1.0
+    assert prior.kl(segments).item() < 0.5
+    assert prior.kl(shuffled).item() > prior.kl(segments).item() + 1.0
     assert prior.judged(segments)["transition_r2"] > 0.95

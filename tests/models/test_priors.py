@@ -434,3 +434,10 @@ def test_the_standard_normal_knows_no_dynamics():
     assert prior.given(segments) is None
     assert float(kl(prior, segments)) == before
     assert prior.state_dict() == prior.metrics() == {}
+
+
+def test_only_rce_has_networks_of_its_own():
+    for prior in (StandardNormal(), dynamics()):
+        assert prior.transition is None
+        assert list(prior.parameters()) == []
+        assert prior.judged(prior.statistics(whole_episodes(1))) == {}

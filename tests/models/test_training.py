@@ -3,6 +3,7 @@
 import copy
 import math
 from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,11 +15,12 @@ from model_problems import vector_episodes, vector_task
 from solar_cli.episodes import Episodes
 from solar_cli.methods import Diverged
 from solar_cli.models import training
+from solar_cli.models.controllable_embedding import ControllableEmbedding
 from solar_cli.models.frames import FrameModel
 from solar_cli.models.latent_model import LatentModel
-from solar_cli.models.priors import BayesianLDS, StandardNormal
+from solar_cli.models.priors import BayesianLDS, Prior, StandardNormal
 from solar_cli.models.training import Dataset, Trainer
-from solar_cli.settings.local import Dynamics, Representation, Training
+from solar_cli.settings.local import Dynamics, Representation, Training, Transition
 from solar_cli.streams import Streams
 
 TASK = vector_task(horizon=8)
@@ -35,8 +37,12 @@ def untrained(prior="linear", task=TASK) -> LatentModel:
     layers = ({"kind": "linear", "width": 6},)
     settings = Representation.model_validate({"latent": 2, "encoder": layers, "decoder": layers})
     networks = FrameModel(settings, task.observation)
-    chosen = BayesianLDS(Dynamics(), 2, task, "cpu") if prior == "linear" else StandardNormal()
-    return LatentModel(networks, chosen, 0.05)
+    made: dict[str, Callable[[], Prior]] = {
+        "linear": lambda: BayesianLDS(Dynamics(), 2, task, "cpu"),
+        "normal": StandardNormal,
+        "network": lambda: ControllableEmbedding(Transition(), 2, task, Streams(0), "cpu"),
+    }
+    return LatentModel(networks, made[prior](), 0.05)
 
 
 def settings(**changes) -> Training:
@@ -62,7 +68,7 @@ def bits(model: LatentModel) -> str:
 # Stopping and going on
 
 
-@pytest.mark.parametrize("prior", ["linear", "normal"])
+@pytest.mark.parametrize("prior", ["linear", "normal", "network"])
 def test_training_stopped_at_any_pulse_goes_on_with_the_same_bits(monkeypatch, prior):
     monkeypatch.setattr(training, "PULSE_STEPS", 3)
     steps, checkpoints = 12, []
@@ -82,6 +88,18 @@ def test_training_stopped_at_any_pulse_goes_on_with_the_same_bits(monkeypatch, p
         assert terms(fresh.fit(NAME, resumed, [EPISODES], steps)) == expected
         assert bits(resumed) == bits(model)
         assert not fresh.under_way
+
+
+def test_networks_of_a_prior_are_trained_with_those_of_frames():
+    model = untrained("network")
+    before = copy.deepcopy(model.prior.state_dict())
+    trainer().fit(NAME, model, [EPISODES], 5)
+    after = model.prior.state_dict()
+    for network in ("transition", "recognition"):
+        moved = {
+            name for name, old in before[network].items() if (old != after[network][name]).any()
+        }
+        assert moved == set(before[network]) - {"action_std", "difference_std"}
 
 
 def test_a_pulse_may_raise(monkeypatch):
