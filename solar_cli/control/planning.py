@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-ROWS = 2048
+ROWS = 1024
 """states that are predicted at a time: more do not fit a cache, and are slower"""
 
 

@@ -72,7 +72,8 @@ def test_a_forecast_is_the_sum_of_costs_along_each_sequence(monkeypatch, rows):
     monkeypatch.setattr(planning, "ROWS", rows)
     actions = torch.stack([sequences(seed=i) for i in range(N)])
     found = RolledOut(dynamics, cost, starts())(actions)
-    expected = [[by_hand(s, u) for u in us] for s, us in zip(starts().numpy(), actions.numpy(), strict=True)]
+    pairs = zip(starts().numpy(), actions.numpy(), strict=True)
+    expected = [[by_hand(start, one) for one in several] for start, several in pairs]
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 

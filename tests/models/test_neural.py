@@ -160,7 +160,7 @@ def test_noise_moves_inputs_and_targets_by_their_std():
     seen = Linear.episodes()
     model = NeuralModel(Linear.model(), None)
     segment = seen.segments(*seen.starts(1), 1)
-    assert float(model.loss(segment)) < 1e-9
+    assert float(model.loss(segment).detach()) < 1e-9
     noise = torch.zeros(len(segment.states), model.entries)
     noise[:, -z:] = 0.5  # of targets alone
     torch.testing.assert_close(model.loss(segment, noise), torch.tensor(0.25))
