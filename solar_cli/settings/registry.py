@@ -36,6 +36,8 @@ class MethodEntry:
     """kinds of observation it can learn from"""
     needs: Literal["costs", "true cost"] = "costs"
     """whether it sees the collected costs only, or the task's cost function"""
+    deviations: str = ""
+    """where it departs from its source, and why"""
 
 
 BUILT_IN = (
@@ -62,6 +64,10 @@ BUILT_IN = (
         source="section 6, global model ablation",
         settings="solar_cli.settings.global_mpc:GlobalMpc",
         learner="solar_cli.methods.global_mpc:GlobalMpc",
+        deviations="a plan goes on from that of the step before, so that a fifth of the release's "
+        "1024 samples and fewer than its 10 iterations do; the release trained its dynamics to "
+        "predict z' and rolled them out as z + f, ours predict and are rolled out as changes, over "
+        "three steps; no push forward for the car (variant forward has it)",
     ),
     MethodEntry(
         name="mpc-nn",
@@ -72,6 +78,8 @@ BUILT_IN = (
         learner="solar_cli.methods.mpc_nn:MpcNn",
         observations=("state",),
         needs="true cost",
+        deviations="their 60 passes over episodes of 1000 steps would be 120 gradient steps for "
+        "ours: 1000 an iteration, and the best by held-out episodes is kept",
     ),
     MethodEntry(
         name="zero",
