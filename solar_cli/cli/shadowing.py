@@ -10,6 +10,9 @@ from solar_cli.cli.printing import complain
 from solar_cli.settings import load_card, method_names
 from solar_cli.settings.card import card_folders
 
+SLIP = 0.75
+"""likeness from which on a name is a slip of the pen; a package's own may begin like another one"""
+
 
 def card_files(name: str) -> list[Path]:
     """The files of that card; the first one is read, and a folder is no card."""
@@ -34,7 +37,9 @@ def tell_misspelt(names: Iterable[str]) -> None:
         card = load_card(name)
         layers = [card.tables, *card.tables.get("variants", {}).values()]
         for method in sorted({method for layer in layers for method in layer.get("methods", {})}):
-            if method not in known and (close := get_close_matches(method, known, n=1)):
+            if method in known:
+                continue
+            if close := get_close_matches(method, known, n=1, cutoff=SLIP):
                 complain(
                     f"solar: note: card {card.path}: 'methods.{method}' has no effect, as no such "
                     f"method is installed: did you mean {close[0]!r}?"

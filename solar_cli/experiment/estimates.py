@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from solar_cli.experiment.matrix import Action, Plan
 from solar_cli.settings import Cell
-from solar_cli.settings.local import LocalControl, LocalMethod
+from solar_cli.settings.local import LatentMethod, LocalControl, StateMethod
 from solar_cli.store.records import CellRecord, State
 
 if TYPE_CHECKING:
@@ -62,20 +62,17 @@ def memory_needs(cell: Cell) -> list[Need]:
     episode = frames * frame + task.horizon * (2 * task.action.size + 1) * FLOAT_BYTES
     sizes = ("task.horizon", "task.observation")
     needs = [Need(judged * episode, "an evaluation", ("evaluation.episodes", *sizes))]
-    if isinstance(method, LocalControl):
-        prefix = f"methods.{cell.method}"
+    prefix = f"methods.{cell.method}"
+    if isinstance(method, StateMethod):
         batch, batches = max(method.batches.initial, method.batches.noisy), f"{prefix}.batches"
         needs.append(Need(batch * episode, "a batch of episodes", (batches, *sizes)))
-        if isinstance(method, LocalMethod):
-            training = method.training
-            drawn = training.segments * min(training.length, frames) * frame
-            longest = (
-                f"{prefix}.training.segments",
-                f"{prefix}.training.length",
-                "task.observation",
-            )
-            needs.append(Need(drawn, "a minibatch of segments", longest))
-        named = "representation.latent" if isinstance(method, LocalMethod) else "components"
+    if isinstance(method, LatentMethod):
+        training = method.training
+        drawn = training.segments * min(training.length, frames) * frame
+        longest = (f"{prefix}.training.segments", f"{prefix}.training.length", "task.observation")
+        needs.append(Need(drawn, "a minibatch of segments", longest))
+    if isinstance(method, LocalControl):
+        named = "representation.latent" if isinstance(method, LatentMethod) else "components"
         long, latents = (f"{prefix}.{named}", "task.horizon"), method.latents(seen)
         matrices = task.horizon * (latents * seen.window) ** 2 * FLOAT_BYTES
         needs.append(Need(matrices, "dynamics of latent states", long))

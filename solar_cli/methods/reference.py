@@ -21,15 +21,17 @@ class Fixed:
     """A `Policy` whose actions do not depend on what is seen, with noise or without."""
 
     def __init__(self, task: TaskSettings, streams: Streams | None) -> None:
-        self._task, self._streams = task, streams
+        self._task = task
+        # One stream for all groups of episodes, as there is of noise.
+        self._draws = None if streams is None else streams.generator("without noise")
 
     def start(self, episodes: int, stream: np.random.Generator | None) -> Floats:
         """(N, T, a) the actions of whole episodes."""
         shape = (episodes, self._task.horizon, self._task.action.size)
-        if self._streams is None:
+        if self._draws is None:
             return np.zeros(shape)
         bound = self._task.action.bound
-        draws = stream if stream is not None else self._streams.generator("without noise")
+        draws = self._draws if stream is None else stream
         return draws.uniform(-bound, bound, shape)
 
     def act(self, observations: NDArray[Any], t: int, state: Floats) -> tuple[Floats, Floats, Any]:

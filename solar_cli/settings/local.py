@@ -206,25 +206,22 @@ class PolicyUpdate(Settings):
         return self
 
 
-class LocalControl(Settings):
-    """What every local method is told, whatever its states are."""
+class StateMethod(Settings):
+    """A method whose states are windows of latents, or of what is observed."""
 
     batches: Batches = setting(..., "line 4 of Algorithm 1")
     budget: Budget = setting(..., "where to stop", presentation=True)
     whitening: bool = setting(
         True, "states have unit variance, and differences in place of older latents", added=True
     )
-    local_fit: LocalFit = setting(LocalFit(), "line 7 of Algorithm 1")
-    cost_fit: CostFit = setting(CostFit(), "quadratic cost")
-    update: PolicyUpdate = setting(PolicyUpdate(), "lines 6 and 8 of Algorithm 1")
 
     def latents(self, observation: Observation) -> int:
         """d: entries that a state has of one frame."""
         raise NotImplementedError
 
 
-class LocalMethod(LocalControl):
-    """A local method in the latent space: SOLAR and its ablations."""
+class LatentMethod(StateMethod):
+    """A method that works in a learned latent space."""
 
     representation: Representation = setting(Representation(), "networks")
     training: Training = setting(Training(), "line 5 of Algorithm 1")
@@ -232,6 +229,18 @@ class LocalMethod(LocalControl):
     def latents(self, observation: Observation) -> int:
         """As many as the representation has."""
         return self.representation.latent
+
+
+class LocalControl(StateMethod):
+    """A local method, whatever its states are."""
+
+    local_fit: LocalFit = setting(LocalFit(), "line 7 of Algorithm 1")
+    cost_fit: CostFit = setting(CostFit(), "quadratic cost")
+    update: PolicyUpdate = setting(PolicyUpdate(), "lines 6 and 8 of Algorithm 1")
+
+
+class LocalMethod(LocalControl, LatentMethod):
+    """A local method in the latent space: SOLAR and its ablations."""
 
 
 class Solar(LocalMethod):

@@ -84,6 +84,18 @@ BUILT_IN = (
         "its slopes, with offsets and noise from its errors, and not iLQR on its rollouts.",
     ),
     MethodEntry(
+        name="global-mpc",
+        summary="SOLAR's representation with neural dynamics and a neural cost on it, and planning "
+        "by the cross-entropy method at every step.",
+        source="section 6, global model ablation",
+        settings="solar_cli.settings.global_mpc:GlobalMpc",
+        learner="solar_cli.methods.global_mpc:GlobalMpc",
+        deviations="a plan goes on from that of the step before, so that a fifth of the release's "
+        "1024 samples and fewer than its 10 iterations do; the release trained its dynamics to "
+        "predict z' and rolled them out as z + f, ours predict and are rolled out as changes, over "
+        "three steps; no push forward for the car (variant forward has it)",
+    ),
+    MethodEntry(
         name="mpc-nn",
         summary="Neural dynamics of states, and the best of random action sequences under them and "
         "the task's own cost.",
@@ -92,6 +104,8 @@ BUILT_IN = (
         learner="solar_cli.methods.mpc_nn:MpcNn",
         observations=("state",),
         needs="true cost",
+        deviations="their 60 passes over episodes of 1000 steps would be 120 gradient steps for "
+        "ours: 1000 an iteration, and the best by held-out episodes is kept",
     ),
     MethodEntry(
         name="zero",

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from solar_cli.control import quadratic_cost
-from solar_cli.models import training
+from solar_cli.models import neural_fit, training
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -20,5 +20,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def as_in_a_worker(worker_torch: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """For every test here, with short steps."""
     monkeypatch.setattr(training, "PULSE_STEPS", 4)
+    monkeypatch.setattr(neural_fit, "JUDGED_STEPS", 4)
     monkeypatch.setattr(quadratic_cost, "LBFGS_ROUNDS", 10)
     monkeypatch.setattr(quadratic_cost, "COMPARED_ROUNDS", 10)

@@ -12,8 +12,18 @@ from bits import digest, through_a_file
 from solar_cli.envs import build_task
 from solar_cli.episodes import Environment, Experience
 from solar_cli.settings import cells, load, load_card, method
-from solar_cli.settings.registry import settings_class
 from solar_cli.streams import Streams
+
+LOCAL = ("training.steps=12", 'cost_fit.per_time="never"')
+"""what makes a local method's iterations short"""
+SMALL: dict[str, tuple[str, ...]] = {
+    "lqr-flm": ('cost_fit.per_time="never"',),
+    "global-mpc": ("training.steps=12", "network.steps=12", "planner.horizon=3"),
+    "mpc-nn": ("network.steps=12",),
+    "random": (),
+    "zero": (),
+}
+"""the same for others"""
 
 
 class Run:
@@ -31,19 +41,19 @@ class Run:
         pulse: Callable[[str, float], None] = lambda *_: None,
         wrap: Callable[[Any], Any] = lambda task: task,
         costs: Callable[[int, np.ndarray], np.ndarray] | None = None,
+        task: str = "nav",
     ) -> None:
-        trained = "training" in settings_class(method(name)).model_fields
-        small = (*["training.steps=12"] * trained, 'cost_fit.per_time="never"', *sets)
+        small = (*SMALL.get(name, LOCAL), *sets)
         changes = ["task.horizon=6", *(f"methods.{name}.{text}" for text in small)]
-        [cell] = cells(load_card("nav"), name, [seed], "smoke", changes)
+        [cell] = cells(load_card(task), name, [seed], "smoke", changes)
         self.configuration = cell.configuration
-        streams, task = Streams(seed), cell.configuration.task
-        simulator = wrap(build_task(task))
+        streams, settings = Streams(seed), cell.configuration.task
+        simulator = wrap(build_task(settings))
         if costs is not None:
             simulator = Costing(simulator, lambda c: costs(self.environment.iteration, c))
-        self.environment = Environment(simulator, task, streams.under("environment"), folder)
+        self.environment = Environment(simulator, settings, streams.under("environment"), folder)
         self.learner = load(method(name).learner)(
-            cell.configuration.method, task, streams.under("learner"), "cpu", pulse
+            cell.configuration.method, settings, streams.under("learner"), "cpu", pulse
         )
         self.metrics: list[dict[str, float]] = []
 
