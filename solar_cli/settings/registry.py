@@ -66,6 +66,15 @@ BUILT_IN = (
         needs="true cost",
     ),
     MethodEntry(
+        name="pixel-mpc",
+        summary="Video prediction and a cost network in pixel space, and the cross-entropy method "
+        "under them at every step.",
+        source="section 6, pixel space model; Finn and Levine 2017",
+        settings="solar_cli.settings.pixel_mpc:PixelMpc",
+        learner="solar_cli.methods.pixel_mpc:PixelMpc",
+        observations=("image",),
+    ),
+    MethodEntry(
         name="zero",
         summary="A reference: no action at all.",
         source="reference policy",
