@@ -8,6 +8,7 @@ Axes: N episodes, S action sequences, H steps ahead, P actions of a plan, a entr
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -81,7 +82,7 @@ class Planner:
             return torch.from_numpy(drawn).to(plan.device).expand(shape)
 
         seen = torch.from_numpy(np.ascontiguousarray(observations)).to(plan.device)
-        window = self.model.scaled(seen)
+        window = self.model.scaled(self.model.pooled(seen))
         plan = cross_entropy(
             lambda actions: self.forecast(window, actions),
             plan,
@@ -99,7 +100,8 @@ class Planner:
         held = actions.repeat_interleave(self.settings.repeat, dim=2)[:, :, : self.settings.horizon]
         group = max(1, CHUNK // actions.shape[1])
         totals = []
-        for some, each in zip(window.split(group), held.split(group), strict=True):
+        parts = zip(torch.split(window, group), torch.split(held, group), strict=True)
+        for some, each in parts:
             steps = [step.cost for step in self.model.rollout(some, each)]
             totals.append(torch.stack(steps).sum(dim=0).view(each.shape[:2]))
         known = self.task.action_cost * held.square().sum(dim=(2, 3))
@@ -145,19 +147,19 @@ class PixelMpc(Learner):
         collected = experience.collect(self.policy, count)
         if not np.isfinite(collected.costs).all():
             raise Diverged(f"a cost of iteration {experience.iteration} is not finite")
-        data = self.clips([experience.batch(name) for name in experience.batches()])
+        data = self.clips(experience.batch(name) for name in experience.batches())
         if first and not self.trainer.under_way:
-            live = torch.from_numpy(collected.live_steps).to(self.device)
-            self.model.scale_by(data.frames[:, :-1][live], data.actions[live], data.costs[live])
+            live = tuple(torch.from_numpy(part).to(self.device) for part in data.live)
+            self.model.scale_by(data.frames[live], data.actions[live], data.costs[live])
         name = f"iteration {experience.iteration}"
         losses = self.trainer.fit(name, self.model, data, first=first)
         self.trained = True
         return losses
 
-    def clips(self, batches: list[Episodes]) -> ClipData:
+    def clips(self, batches: Iterable[Episodes]) -> ClipData:
         """Clips as far as a plan looks ahead."""
         horizon = min(self.settings.planning.horizon, self.task.horizon)
-        return ClipData(batches, horizon, self.task.action_cost, self.device)
+        return ClipData(batches, horizon, self.task.action_cost, self.model, self.device)
 
     def state_dict(self) -> dict[str, Any]:
         """The networks, and a training under way."""
@@ -186,3 +188,15 @@ class PixelMpc(Learner):
             f"frame_error_{len(ratio)}": float(ratio[-1]),
             "cost_r2": 1 - float(found.costs),
         }
+
+    @torch.no_grad()
+    def foresee(self, episodes: Episodes) -> NDArray[Any] | None:
+        """As `Foreseeing.foresee`, as far as a plan looks ahead."""
+        if not self.trained:
+            return None
+        every = np.arange(len(episodes))
+        clips = self.clips([episodes]).at(every, np.zeros_like(every))
+        window = self.model.scaled(clips.frames[:, : episodes.window])
+        steps = self.model.rollout(window, clips.actions[:, None])
+        frames = [self.model.as_frames(step.frame) for step in steps]
+        return torch.stack(frames, dim=1).cpu().numpy()

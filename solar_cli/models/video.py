@@ -42,7 +42,7 @@ class Step(NamedTuple):
 
 
 class VideoModel(nn.Module):
-    """Networks and scales; frames come as stored, uint8 (..., C, H, W)."""
+    """Networks and scales."""
 
     frame_mean: Tensor
     frame_scale: Tensor
@@ -101,21 +101,30 @@ class VideoModel(nn.Module):
         self.register_buffer("_across", columns - columns[:, None], persistent=False)
         self.to(memory_format=torch.channels_last)  # twice as fast on a CPU
 
-    def scale_by(self, frames: Tensor, actions: Tensor, costs: Tensor) -> None:
-        """Take means and deviations from live frames (n, C, H, W), actions (m, a), costs (m,)."""
-        pooled = torch.cat([self._pooled(chunk) for chunk in torch.split(frames, CHUNK)])
-        self.frame_mean.copy_(pooled.mean(dim=0))
-        spread = (pooled - self.frame_mean).square().mean().sqrt()
+    def scale_by(
+        self,
+        frames: Float[Tensor, "n C h w"],
+        actions: Float[Tensor, "n a"],
+        costs: Float[Tensor, " n"],
+    ) -> None:
+        """Take means and deviations from live steps; frames are pooled."""
+        self.frame_mean.copy_(frames.mean(dim=0, dtype=torch.float32))
+        chunks = [(part - self.frame_mean).square().mean(dim=0) for part in frames.split(CHUNK)]
+        spread = torch.stack(chunks).mean().sqrt()
         self.frame_scale.copy_(spread.clamp_min(LEAST_SCALE))
         self.action_scale.copy_(actions.square().mean(dim=0).sqrt().clamp_min(LEAST_SCALE))
         self.cost_mean.copy_(costs.mean())
         self.cost_scale.copy_(costs.std(correction=0).clamp_min(LEAST_SCALE))
 
-    def scaled(self, frames: Tensor) -> Float[Tensor, "*n C h w"]:
-        """Stored frames as the networks see them: pooled, around the mean frame."""
-        flat = frames.reshape(-1, *frames.shape[-3:])
-        scaled = (self._pooled(flat) - self.frame_mean) / self.frame_scale
-        return scaled.view(*frames.shape[:-3], *self.shape)
+    def pooled(self, frames: Tensor) -> Float[Tensor, "*n C h w"]:
+        """Means of blocks of pixels of frames as stored, uint8 (..., C, H, W)."""
+        flat = frames.reshape(-1, *frames.shape[-3:]).float()
+        means = functional.avg_pool2d(flat, self.settings.pool)
+        return means.view(*frames.shape[:-3], *self.shape)
+
+    def scaled(self, pooled: Float[Tensor, "*n C h w"]) -> Float[Tensor, "*n C h w"]:
+        """As the networks see them: around the mean frame."""
+        return (pooled - self.frame_mean) / self.frame_scale
 
     def as_frames(self, scaled: Float[Tensor, "n C h w"]) -> Tensor:
         """Scaled frames in stored units and at full size."""
@@ -143,10 +152,6 @@ class VideoModel(nn.Module):
         """What the newest frame of each window costs, without its action."""
         return self._priced(self._read(window.flatten(0, 1)).view(*window.shape[:2], -1))
 
-    def _pooled(self, frames: Tensor) -> Float[Tensor, "n C h w"]:
-        pool = self.settings.pool
-        return functional.avg_pool2d(frames.float(), pool) if pool > 1 else frames.float()
-
     def _read(self, frames: Float[Tensor, "n C h w"]) -> Float[Tensor, "n f"]:
         features: Tensor = self.features(frames)
         return features
@@ -157,11 +162,13 @@ class VideoModel(nn.Module):
     def _parted(
         self, window: Float[Tensor, "N W C h w"]
     ) -> tuple[Float[Tensor, "N h Cw"], Float[Tensor, "K N h Cw"]]:
-        """The newest frame over the background, by layers, rows first: that of no motion, others."""
+        """Layers of the newest frame over the background, rows first: that which stays, the rest."""
         count, channels = len(window), self.shape[0]
         logits = self.masks(window.flatten(1, 2)).view(count, -1, *self.shape)
         layers = logits.softmax(dim=1) * (window[:, -1] - self.background)[:, None]
-        rows = layers.permute(1, 0, 3, 2, 4).reshape(-1, count, self.shape[1], channels * self.shape[2])
+        rows = layers.permute(1, 0, 3, 2, 4).reshape(
+            -1, count, self.shape[1], channels * self.shape[2]
+        )
         return rows[0], rows[1:]
 
     def _shifted(

@@ -6,6 +6,7 @@ What a step draws is keyed by its number, and `VideoTrainer.state_dict` holds th
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,8 +30,8 @@ POOLINGS = (1, 2, 4)
 class Clips(NamedTuple):
     """Windows of frames, and what followed."""
 
-    frames: Tensor
-    """(N, W+H, C, H, W) as stored: a window, its newest frame at W-1, and the next H"""
+    frames: Float[Tensor, "N WH C h w"]
+    """pooled: a window, its newest frame at W-1, and the next H"""
     actions: Float[Tensor, "N H a"]
     costs: Float[Tensor, "N H1"]
     """of the state alone, at the window's newest frame and the next H"""
@@ -51,33 +52,47 @@ class Errors(NamedTuple):
 
 
 class ClipData:
-    """Episodes on the device; clips of them start at any live step."""
+    """Batches of episodes on the device, pooled as they come; clips start at any live step."""
 
     def __init__(
-        self, batches: list[Episodes], horizon: int, action_cost: float, device: str
+        self,
+        batches: Iterable[Episodes],
+        horizon: int,
+        action_cost: float,
+        model: VideoModel,
+        device: str,
     ) -> None:
-        self.episodes = Episodes.joined(batches)
-        self.newest = len(batches[-1])
         self.horizon, self.device = horizon, device
-        self.frames = torch.from_numpy(self.episodes.frames).to(device)
-        self.actions = torch.from_numpy(self.episodes.actions).float().to(device)
-        known = action_cost * np.square(self.episodes.actions).sum(axis=-1)
-        self.costs = torch.from_numpy(self.episodes.costs - known).float().to(device)
+        frames, actions, costs, lengths = [], [], [], []
+        for episodes in batches:
+            self.window, self.newest = episodes.window, len(episodes)
+            # Half floats: of many episodes the frames are what fills the memory.
+            seen = torch.from_numpy(episodes.frames).to(device)
+            frames.append(torch.stack([model.pooled(one).half() for one in seen]))
+            actions.append(torch.from_numpy(episodes.actions).float())
+            known = action_cost * np.square(episodes.actions).sum(axis=-1)
+            costs.append(torch.from_numpy(episodes.costs - known).float())
+            lengths.append(episodes.lengths)
+        self.frames = torch.cat(frames)
+        self.actions, self.costs = (torch.cat(part).to(device) for part in (actions, costs))
+        self.lengths = np.concatenate(lengths)
+        live = np.arange(self.actions.shape[1]) < self.lengths[:, None]
+        self.live = np.nonzero(live)
+        """episodes and steps that were lived"""
 
     def drawn(self, count: int, stream: np.random.Generator) -> Clips:
         """Clips at random live steps, half of them from the newest batch of several."""
-        rows, steps = np.nonzero(self.episodes.live_steps)
+        rows, steps = self.live
         chosen = stream.integers(len(rows), size=count)
-        first = int(np.searchsorted(rows, len(self.episodes) - self.newest))
-        if first:
+        if first := int(np.searchsorted(rows, len(self.lengths) - self.newest)):
             chosen[: count // 2] = stream.integers(first, len(rows), size=count // 2)
         return self.at(rows[chosen], steps[chosen])
 
     def at(self, rows: NDArray[np.int64], steps: NDArray[np.int64]) -> Clips:
         """Those of episodes ``rows`` whose windows end at ``steps``; what was not lived is zero."""
-        window, horizon = self.episodes.window, self.episodes.horizon
+        window, horizon = self.window, self.actions.shape[1]
         times = steps[:, None] + np.arange(1 - window, self.horizon + 1)
-        lengths = self.episodes.lengths[rows, None]
+        lengths = self.lengths[rows, None]
         ahead = times[:, window - 1 :]
 
         def taken(values: Tensor, when: NDArray[np.int64], last: int) -> Tensor:
@@ -86,7 +101,7 @@ class ClipData:
 
         costs = torch.from_numpy(ahead < lengths).to(self.device)
         return Clips(
-            taken(self.frames, times, horizon),
+            taken(self.frames, times, horizon).float(),
             taken(self.actions, ahead[:, :-1], horizon - 1) * costs[:, :-1, None],
             taken(self.costs, ahead, horizon - 1),
             costs[:, :-1],
@@ -137,7 +152,7 @@ class VideoTrainer:
         settings = self.settings
         steps = settings.steps if first else settings.later_steps
         rate = settings.learning_rate if first else settings.later_rate
-        optimiser = torch.optim.Adam(model.parameters(), lr=rate)
+        optimiser = torch.optim.Adam(model.parameters(), lr=rate, fused=True)
         if self._running is None or self._running["name"] != name:
             self._running = {"name": name, "step": 0, "errors": (0.0, 0.0)}
         elif "optimiser" in self._running:
@@ -154,11 +169,14 @@ class VideoTrainer:
             loss = frames / len(POOLINGS) + found.costs
             optimiser.zero_grad()
             loss.backward()
-            torch.nn.utils.clip_grad_norm_(model.parameters(), settings.clip)
+            torch.nn.utils.clip_grad_norm_(model.parameters(), settings.clip, foreach=True)
             optimiser.step()
             running["step"] += 1
             if running["step"] % PULSE_STEPS == 0 or running["step"] == steps:
-                running["errors"] = (float(frames.detach()) / len(POOLINGS), float(found.costs.detach()))
+                running["errors"] = (
+                    float(frames.detach()) / len(POOLINGS),
+                    float(found.costs.detach()),
+                )
                 if not math.isfinite(sum(running["errors"])):
                     raise Diverged(f"step {running['step']} of {name}: the loss is not finite")
                 self.pulse(f"training the video model ({name})", running["step"] / steps)
