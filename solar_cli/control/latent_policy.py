@@ -30,6 +30,19 @@ class Embedding(Protocol):
         """Latents of single frames."""
 
 
+def latest_state(
+    embedding: Embedding, observations: NDArray[Any], latents: tuple[Tensor, ...], window: int
+) -> tuple[Float[Tensor, "N z"], tuple[Tensor, ...]]:
+    """The state that windows of frames end in, given the ``latents`` of the frames before.
+
+    Only the newest frame is encoded; the second result is to be given with the next observation.
+    """
+    newest = embedding.encode(observations[:, -1])
+    # Before the start of an episode its first frame repeats.
+    latents = (newest, *(latents or (newest,) * window))[:window]
+    return embedding.basis.state(torch.stack(latents, dim=1)), latents
+
+
 class Acting(NamedTuple):
     """What is carried through an episode."""
 
@@ -66,11 +79,8 @@ class LatentPolicy:
         mean = self.gains.k[t].expand(len(observations), -1)
         latents = state.latents
         if self.embedding.trained:
-            newest = self.embedding.encode(observations[:, -1])
-            # Before the start of an episode its first frame repeats.
-            latents = (newest, *(latents or (newest,) * self.window))[: self.window]
-            z = self.embedding.basis.state(torch.stack(latents, dim=1)).cpu()
-            mean = z @ self.gains.K[t].T + self.gains.k[t]
+            z, latents = latest_state(self.embedding, observations, latents, self.window)
+            mean = z.cpu() @ self.gains.K[t].T + self.gains.k[t]
         action = mean
         if state.noise is not None:
             action = mean + state.noise[:, t] @ self._spread[t].T

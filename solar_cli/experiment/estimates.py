@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from solar_cli.experiment.matrix import Action, Plan
 from solar_cli.settings import Cell
-from solar_cli.settings.local import LocalMethod
+from solar_cli.settings.local import LatentMethod, LocalMethod
 from solar_cli.store.records import CellRecord, State
 
 if TYPE_CHECKING:
@@ -61,14 +61,16 @@ def memory_needs(cell: Cell) -> list[Need]:
     episode = frames * frame + task.horizon * (2 * task.action.size + 1) * FLOAT_BYTES
     sizes = ("task.horizon", "task.observation")
     needs = [Need(judged * episode, "an evaluation", ("evaluation.episodes", *sizes))]
-    if isinstance(method, LocalMethod):
-        prefix, states = f"methods.{cell.method}", method.representation.latent * seen.window
+    if isinstance(method, LatentMethod):
+        prefix = f"methods.{cell.method}"
         batch, batches = max(method.batches.initial, method.batches.noisy), f"{prefix}.batches"
         needs.append(Need(batch * episode, "a batch of episodes", (batches, *sizes)))
         training = method.training
         drawn = training.segments * min(training.length, frames) * frame
         longest = (f"{prefix}.training.segments", f"{prefix}.training.length", "task.observation")
         needs.append(Need(drawn, "a minibatch of segments", longest))
+    if isinstance(method, LocalMethod):
+        states = method.representation.latent * seen.window
         matrices = task.horizon * states**2 * FLOAT_BYTES
         latent = f"{prefix}.representation.latent"
         needs.append(Need(matrices, "dynamics of latent states", (latent, "task.horizon")))

@@ -5,14 +5,13 @@ A local method gives `make_prior` and `iterate`.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from dataclasses import replace
 from itertools import chain, groupby
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from solar_cli.control.latent_policy import LatentPolicy
 from solar_cli.control.linear_gaussian import (
@@ -29,9 +28,9 @@ from solar_cli.control.step_size import StepSize
 from solar_cli.control.task_checks import task_metrics
 from solar_cli.control.trajectories import Trajectories
 from solar_cli.control.trust_region import Anchor, TrustRegion, promised_fall
-from solar_cli.episodes import Episodes, Evaluation, Experience
-from solar_cli.models.diagnostics import latent_metrics
-from solar_cli.models.priors import LatentPrior, Prior
+from solar_cli.episodes import Episodes, Experience
+from solar_cli.methods.latent import LatentLearner
+from solar_cli.models.priors import LatentPrior
 from solar_cli.models.representation import Representation
 from solar_cli.pulse import Diverged, Pulse
 from solar_cli.settings import TaskSettings
@@ -42,7 +41,7 @@ MOST_BATCHES = 4
 """of the policy that is built upon, the last ones: bounds memory and time"""
 
 
-class LocalLearner(ABC):
+class LocalLearner(LatentLearner):
     """A representation, a linear-Gaussian policy on its states, and the rules around an update."""
 
     def __init__(
@@ -54,12 +53,7 @@ class LocalLearner(ABC):
         pulse: Pulse,
     ) -> None:
         self.settings = settings
-        self.task = task
-        self.streams = streams
-        self.device = device
-        self.pulse = pulse
-        self.latent = settings.representation.latent
-        self.representation = self.make_representation()
+        super().__init__(settings, task, streams, device, pulse)
         self.gains = initial_policy(
             task.horizon, self.representation.state_size, task.action.size, task.exploration.std
         )
@@ -67,10 +61,6 @@ class LocalLearner(ABC):
         low, high = settings.update.multiplier
         self.trust_region = TrustRegion(StepSize(low=low, high=high))
         self.updates = 0
-
-    @abstractmethod
-    def make_prior(self) -> Prior:
-        """The prior over latents that the representation is trained with."""
 
     @abstractmethod
     def iterate(self, experience: Experience) -> dict[str, float]:
@@ -275,27 +265,6 @@ class LocalLearner(ABC):
         if self._needs_line_six(region.best):
             return previous.held(reached, self.task.horizon)
         return region.best.gains
-
-    def diagnose(self, evaluation: Evaluation) -> dict[str, float]:
-        """R2 of linear maps between true positions and the newest latents, both ways."""
-        if not self.representation.trained or not evaluation.truth_names:
-            return {}
-        states = self.representation.embed(evaluation.episodes)[..., : self.latent]
-        live = evaluation.episodes.live_frames
-        latents = states.cpu().numpy()[live]
-        return latent_metrics(latents, evaluation.truth[live], evaluation.truth_names)
-
-    def encode(self, episodes: Episodes) -> NDArray[Any] | None:
-        """Latents by the encoder's mean, as they are before whitening."""
-        if not self.representation.trained:
-            return None
-        every = episodes.frames.reshape(-1, *episodes.frames.shape[2:])
-        latents = self.representation.encode(every).cpu().numpy()
-        return latents.reshape(*episodes.frames.shape[:2], -1)
-
-    def reconstruct(self, episodes: Episodes) -> NDArray[Any] | None:
-        """Frames as the observation model expects them from the encoder's mean."""
-        return self.representation.reconstruct(episodes) if self.representation.trained else None
 
     def state_dict(self) -> dict[str, Any]:
         """Representation, gains, trust region."""

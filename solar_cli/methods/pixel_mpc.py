@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from solar_cli.control.exploration import Exploration, smooth_noise
-from solar_cli.control.planning import Search, cross_entropy
+from solar_cli.control.planning import CrossEntropy
 from solar_cli.episodes import Episodes, Evaluation, Experience, Policy
 from solar_cli.methods import Learner
 from solar_cli.models.video import CHUNK, VideoModel
@@ -47,15 +47,12 @@ class Planner:
     def __init__(
         self, settings: PixelMpcSettings, task: TaskSettings, model: VideoModel, streams: Streams
     ) -> None:
-        planning = settings.planning
-        self.settings, self.task, self.model, self.streams = planning, task, model, streams
-        self.actions = -(-planning.horizon // planning.repeat)
-        self.search = Search(
-            self.actions,
-            planning.samples,
-            planning.iterations,
-            planning.elites,
-            task.action.bound,
+        planner, std = settings.planner, task.exploration.std
+        self.settings, self.task, self.model, self.streams = planner, task, model, streams
+        self.actions = -(-planner.horizon // planner.repeat)
+        self.std = planner.std * std
+        self.search = CrossEntropy(
+            planner.iterations, planner.elites, task.action.bound, planner.least_std * std
         )
 
     def start(self, episodes: int, stream: np.random.Generator | None) -> Planned:
@@ -74,22 +71,16 @@ class Planner:
         self, observations: NDArray[Any], t: int, state: Planned
     ) -> tuple[Floats, Floats, Planned]:
         """The first action of the plan, and noise."""
-        draws, plan = self.streams.generator("plan", t), state.plan
+        plan = state.plan
 
-        def normal(*shape: int) -> Tensor:
-            """The same draws for every episode, whichever are planned for side by side."""
-            drawn = draws.standard_normal(shape[1:], dtype=np.float32)
-            return torch.from_numpy(drawn).to(plan.device).expand(shape)
+        def normal(iteration: int) -> Float[Tensor, "S P a"]:
+            draws = self.streams.generator("plan", t, iteration)
+            shape = (self.settings.samples, *plan.shape[1:])
+            return torch.from_numpy(draws.standard_normal(shape, dtype=np.float32)).to(plan)
 
         seen = torch.from_numpy(np.ascontiguousarray(observations)).to(plan.device)
         window = self.model.scaled(self.model.pooled(seen))
-        plan = cross_entropy(
-            lambda actions: self.forecast(window, actions),
-            plan,
-            torch.full_like(plan, self.settings.std * self.task.exploration.std),
-            self.search,
-            normal,
-        )
+        plan = self.search(lambda actions: self.forecast(window, actions), plan, self.std, normal)
         mean = plan[:, 0].double().cpu().numpy()
         return mean + state.noise[:, t], mean, Planned(state.noise, self.later(plan))
 
@@ -158,7 +149,7 @@ class PixelMpc(Learner):
 
     def clips(self, batches: Iterable[Episodes]) -> ClipData:
         """Clips as far as a plan looks ahead."""
-        horizon = min(self.settings.planning.horizon, self.task.horizon)
+        horizon = min(self.settings.planner.horizon, self.task.horizon)
         return ClipData(batches, horizon, self.task.action_cost, self.model, self.device)
 
     def state_dict(self) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from solar_cli.models.priors import LatentPrior, Prior, Segments
 from solar_cli.models.training import Trainer
 from solar_cli.pulse import Pulse
 from solar_cli.settings import TaskSettings
-from solar_cli.settings.local import LocalMethod
+from solar_cli.settings.local import LatentMethod
 from solar_cli.streams import Streams
 
 ACTIVE_SHARE = 0.9  # of a latent's variance that its mean must carry for it to count as active
@@ -52,7 +52,7 @@ class Representation:
 
     def __init__(
         self,
-        settings: LocalMethod,
+        settings: LatentMethod,
         task: TaskSettings,
         make_prior: Callable[[], Prior],
         cost_score: CostScore,

@@ -162,7 +162,7 @@ class VideoModel(nn.Module):
     def _parted(
         self, window: Float[Tensor, "N W C h w"]
     ) -> tuple[Float[Tensor, "N h Cw"], Float[Tensor, "K N h Cw"]]:
-        """Layers of the newest frame over the background, rows first: that which stays, the rest."""
+        """Layers of the newest frame over the background, rows first: what stays, and the rest."""
         count, channels = len(window), self.shape[0]
         logits = self.masks(window.flatten(1, 2)).view(count, -1, *self.shape)
         layers = logits.softmax(dim=1) * (window[:, -1] - self.background)[:, None]

@@ -180,13 +180,18 @@ class PolicyUpdate(Settings):
         return self
 
 
-class LocalMethod(Settings):
-    """A local method in the latent space: SOLAR and its ablations."""
+class LatentMethod(Settings):
+    """A method that works in a learned latent space."""
 
     batches: Batches = setting(..., "line 4 of Algorithm 1")
     budget: Budget = setting(..., "where to stop", presentation=True)
     representation: Representation = setting(Representation(), "networks")
     training: Training = setting(Training(), "line 5 of Algorithm 1")
+
+
+class LocalMethod(LatentMethod):
+    """A local method in the latent space: SOLAR and its ablations."""
+
     local_fit: LocalFit = setting(LocalFit(), "line 7 of Algorithm 1")
     cost_fit: CostFit = setting(CostFit(), "quadratic cost")
     update: PolicyUpdate = setting(PolicyUpdate(), "lines 6 and 8 of Algorithm 1")

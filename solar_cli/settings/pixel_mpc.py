@@ -39,7 +39,7 @@ class VideoTraining(Settings):
     clip: float = setting(1.0, "largest norm of the gradient", gt=0)
 
 
-class Planning(Settings):
+class Planner(Settings):
     """Model-predictive control by the cross-entropy method, anew at every step."""
 
     horizon: int = setting(6, "steps that are predicted, in training too", ge=1)
@@ -48,6 +48,7 @@ class Planning(Settings):
     iterations: int = setting(3, "refits of their distribution", ge=1)
     elites: int = setting(8, "sequences of least cost that it is refitted to", ge=1)
     std: float = setting(2.0, "of the first sequences, over that of exploration", gt=0)
+    least_std: float = setting(0.1, "least std of the later ones, over that of exploration", ge=0)
     noise: float = setting(1.0, "std of noise on collected actions, over that of exploration", ge=0)
 
 
@@ -59,4 +60,4 @@ class PixelMpc(Settings):
     budget: Budget = setting(Budget(desk=240, full=400), "where to stop", presentation=True)
     video: Video = setting(Video(), "networks")
     training: VideoTraining = setting(VideoTraining(), "of the networks")
-    planning: Planning = setting(Planning(), "how actions are chosen")
+    planner: Planner = setting(Planner(), "how actions are chosen")

@@ -56,6 +56,14 @@ BUILT_IN = (
         learner="solar_cli.methods.vae:Vae",
     ),
     MethodEntry(
+        name="global-mpc",
+        summary="SOLAR's representation with neural dynamics and a neural cost on it, and planning "
+        "by the cross-entropy method at every step.",
+        source="section 6, global model ablation",
+        settings="solar_cli.settings.global_mpc:GlobalMpc",
+        learner="solar_cli.methods.global_mpc:GlobalMpc",
+    ),
+    MethodEntry(
         name="mpc-nn",
         summary="Neural dynamics of states, and the best of random action sequences under them and "
         "the task's own cost.",

@@ -1,0 +1,69 @@
+"""A policy that plans anew at every step, takes the first action of each plan, and adds noise."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from solar_cli.control.exploration import smooth_noise
+from solar_cli.control.latent_policy import Embedding, latest_state
+from solar_cli.settings import TaskSettings
+
+Floats = NDArray[np.float64]
+
+
+class Planner(Protocol):
+    """What chooses actions for the next H steps."""
+
+    def __call__(
+        self, states: Float[Tensor, "N z"], t: int, before: Float[Tensor, "N H a"] | None
+    ) -> Float[Tensor, "N H a"]:
+        """Plans for step ``t``; ``before`` are those of the step before, None at the start."""
+
+
+class Acting(NamedTuple):
+    """What is carried through an episode."""
+
+    noise: Floats
+    """(N, T, a)"""
+    latents: tuple[Tensor, ...]
+    """(N, d) of the window's frames, newest first"""
+    plan: Float[Tensor, "N H a"] | None
+
+
+class PlanningPolicy:
+    """a_t: the first action of the plan for the state of now, and noise of deviation ``std``."""
+
+    def __init__(
+        self,
+        embedding: Embedding,
+        planner: Planner,
+        std: float,
+        smoothing: float,
+        task: TaskSettings,
+    ) -> None:
+        self.embedding, self.planner = embedding, planner
+        self.std, self.smoothing, self.task = std, smoothing, task
+
+    def start(self, episodes: int, stream: np.random.Generator | None) -> Acting:
+        """Draw the noise of whole episodes."""
+        shape = (episodes, self.task.horizon, self.task.action.size)
+        if stream is None:
+            return Acting(np.zeros(shape), (), None)
+        return Acting(self.std * smooth_noise(shape, self.smoothing, stream), (), None)
+
+    @torch.no_grad()
+    def act(
+        self, observations: NDArray[Any], t: int, state: Acting
+    ) -> tuple[Floats, Floats, Acting]:
+        """As `Policy.act`; only the newest frame is encoded."""
+        window = self.task.observation.window
+        z, latents = latest_state(self.embedding, observations, state.latents, window)
+        plan = self.planner(z.float(), t, state.plan)
+        mean = plan[:, 0].double().cpu().numpy()
+        return mean + state.noise[:, t], mean, Acting(state.noise, latents, plan)

@@ -1,0 +1,235 @@
+"""The one fit of neural models to episodes: dynamics, and where it is to be learned, the cost.
+
+Part of each batch of episodes is held out: it says which step's parameters are kept, and how good
+they are. A fit can stop at any pulse and go on with the same bits, as `models.training` can.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from solar_cli.models.neural import (
+    NeuralCost,
+    NeuralDynamics,
+    Segment,
+    Sequences,
+    cost_r2,
+    prediction_r2,
+)
+from solar_cli.pulse import Diverged, Pulse
+from solar_cli.settings.neural import NeuralFit
+from solar_cli.streams import Streams
+
+JUDGED_STEPS = 50
+"""gradient steps between two looks at held-out episodes, and two pulses"""
+JUDGED_SEGMENTS = 4096
+
+
+class NeuralModel(nn.Module):
+    """Dynamics, and a cost that is learned or None."""
+
+    standardised: Tensor
+
+    def __init__(self, dynamics: NeuralDynamics, cost: NeuralCost | None) -> None:
+        super().__init__()
+        self.dynamics, self.cost = dynamics, cost
+        self.entries = len(dynamics.change.x_mean) + dynamics.newest  # of the noise of a segment
+        self.register_buffer("standardised", torch.tensor(False))
+
+    @property
+    def fitted(self) -> bool:
+        """Whether it has been shown anything."""
+        return bool(self.standardised)
+
+    def standardise_by(self, seen: Sequences) -> None:
+        """Take all scales from episodes, the first ones that there are."""
+        segment, d = seen.segments(*seen.starts(1), 1), self.dynamics.newest
+        states = segment.states[:, 0]
+        change = segment.states[:, 1, :d] - states[:, :d]
+        self.dynamics.change.standardise_by(
+            torch.cat([states, segment.actions[:, 0]], dim=-1), change
+        )
+        if self.cost is not None:
+            self.cost.standardise_by(states[:, :d], segment.costs)
+        self.standardised.fill_(True)
+
+    def loss(self, segment: Segment, noise: Tensor | None = None) -> Tensor:
+        """Squared errors in units of the targets' std: of newest blocks, and of costs.
+
+        Each step's prediction is the next one's input; ``noise`` (n, i + d) is added to what the
+        first step is made from, and to what it is compared with.
+        """
+        dynamics, d = self.dynamics, self.dynamics.newest
+        scale = dynamics.change
+        states, actions = segment.states[:, 0], segment.actions
+        targets = segment.states[:, 1:, :d]
+        errors = []
+        for k in range(actions.shape[1]):
+            action, target = actions[:, k], targets[:, k]
+            start = states[:, :d]
+            if noise is not None and k == 0:
+                inputs = torch.cat([states, action], dim=-1) + noise[:, :-d] * scale.x_std
+                change = scale(inputs)
+                target = target + noise[:, -d:] * scale.y_std
+            else:
+                change = dynamics.changes(states, action)
+            errors.append((start + change - target) / scale.y_std)
+            states = dynamics.follow(states, change)
+        total = torch.stack(errors).square().mean()
+        if self.cost is not None:
+            wrong = (self.cost.of(segment.states[:, :-1]) - segment.costs) / self.cost.y_std
+            total = total + wrong.square().mean()
+        return total
+
+
+class NeuralTrainer:
+    """Adam on `NeuralModel.loss`; the parameters that held-out segments like best are kept."""
+
+    def __init__(self, settings: NeuralFit, streams: Streams, pulse: Pulse) -> None:
+        self.settings = settings
+        self.streams = streams
+        self.pulse = pulse
+        self._running: dict[str, Any] | None = None
+        self._optimiser: torch.optim.Adam | None = None
+
+    def fit(
+        self,
+        name: str,
+        model: NeuralModel,
+        batches: list[Sequences],
+        explored: int,
+        horizon: int,
+    ) -> dict[str, float]:
+        """Fit to batches, ``explored`` first ones of plain noise; R2 of held-out episodes.
+
+        ``name`` keys the random draws; a fit of that name that was interrupted goes on.
+        """
+        split = [max(1, round(self.settings.held_out * len(batch))) for batch in batches]
+        learned = [batch.some(slice(None, -k)) for batch, k in zip(batches, split, strict=True)]
+        kept = [batch.some(slice(-k, None)) for batch, k in zip(batches, split, strict=True)]
+        held_out = Sequences.joined(kept)
+        seen = Sequences.joined(learned)
+        if not model.fitted:
+            model.standardise_by(seen)
+        steps = min(self.settings.unroll, seen.longest, held_out.longest)
+        old = sum(len(batch) for batch in learned[:explored])
+        draws = Minibatches(seen, old, steps, model.entries, self.settings)
+        judged = held_out.segments(*_thinned(*held_out.starts(steps)), steps)
+        self._train(name, model, draws, judged)
+        metrics = {
+            "one_step_r2": prediction_r2(model.dynamics, held_out, 1),
+            "horizon_r2": prediction_r2(model.dynamics, held_out, horizon),
+        }
+        if model.cost is not None:
+            metrics["cost_r2"] = cost_r2(model.cost, held_out)
+        return {**self._end(), **metrics}
+
+    def _train(self, name: str, model: NeuralModel, draws: Minibatches, judged: Segment) -> None:
+        optimiser = torch.optim.Adam(model.parameters(), lr=self.settings.learning_rate)
+        if self._running is None or self._running["name"] != name:
+            start = {key: value.clone() for key, value in model.state_dict().items()}
+            self._running = {
+                "name": name,
+                "step": 0,
+                "least": math.inf,
+                "kept": start,
+                "kept_step": 0,
+                "seconds": 0.0,
+            }
+        elif "optimiser" in self._running:
+            optimiser.load_state_dict(self._running.pop("optimiser"))
+        self._optimiser = optimiser
+        running, last, settings = self._running, time.perf_counter(), self.settings
+        while running["step"] < settings.steps:
+            rate = settings.learning_rate
+            if settings.schedule == "cosine":
+                rate *= 0.5 * (1 + math.cos(math.pi * running["step"] / settings.steps))
+            for group in optimiser.param_groups:
+                group["lr"] = rate
+            segment, noise = draws.draw(self.streams.generator(name, running["step"]))
+            loss = model.loss(segment, noise)
+            optimiser.zero_grad()
+            torch.autograd.backward(loss)
+            optimiser.step()
+            running["step"] += 1
+            if running["step"] % JUDGED_STEPS and running["step"] < settings.steps:
+                continue
+            self._judge(model, judged)
+            running["seconds"] += time.perf_counter() - last
+            self.pulse(f"training the networks ({name})", running["step"] / settings.steps)
+            last = time.perf_counter()
+        model.load_state_dict(running["kept"])
+
+    @torch.no_grad()
+    def _judge(self, model: NeuralModel, judged: Segment) -> None:
+        """Keep the parameters of now, where held-out segments say that they are the best."""
+        running = self._running
+        assert running is not None
+        loss = float(model.loss(judged))
+        if not math.isfinite(loss):
+            raise Diverged(f"step {running['step']} of {running['name']}: the loss is not finite")
+        if loss < running["least"]:
+            kept = {key: value.clone() for key, value in model.state_dict().items()}
+            running.update(least=loss, kept=kept, kept_step=running["step"])
+
+    def _end(self) -> dict[str, float]:
+        running = self._running
+        assert running is not None
+        self._running = self._optimiser = None
+        return {
+            "held_out_loss": running["least"],
+            "kept_step": float(running["kept_step"]),
+            "seconds_training": running["seconds"],
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """A fit that is under way: its step, what is kept, and the optimiser."""
+        if self._running is None:
+            return {}
+        state = dict(self._running)
+        if self._optimiser is not None:
+            state["optimiser"] = self._optimiser.state_dict()
+        return state
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take up a fit that was under way; it goes on when ``fit`` is called with its name."""
+        self._running = dict(state) or None
+        self._optimiser = None
+
+
+class Minibatches:
+    """Random segments of what is learned from, the first ``explored`` episodes of it of noise."""
+
+    def __init__(
+        self, seen: Sequences, explored: int, steps: int, entries: int, settings: NeuralFit
+    ) -> None:
+        self.seen, self.steps, self.settings = seen, steps, settings
+        self.episode, self.step = seen.starts(steps)
+        self.old = int((self.episode < explored).sum())
+        self.entries = entries
+
+    def draw(self, stream: np.random.Generator) -> tuple[Segment, Tensor | None]:
+        """Segments, and noise where settings ask for it."""
+        settings, count, old = self.settings, len(self.episode), self.old
+        rows = stream.integers(count, size=settings.batch)
+        if settings.new != "alike" and 0 < old < count:
+            fresh = round(settings.new * settings.batch)
+            rows[:fresh] = stream.integers(old, count, size=fresh)
+            rows[fresh:] = stream.integers(old, size=settings.batch - fresh)
+        chosen = torch.from_numpy(rows).to(self.episode.device)
+        segment = self.seen.segments(self.episode[chosen], self.step[chosen], self.steps)
+        if settings.noise == 0:
+            return segment, None
+        noise = stream.standard_normal((settings.batch, self.entries), dtype=np.float32)
+        return segment, settings.noise * torch.from_numpy(noise).to(segment.states)
+
+
+def _thinned(episode: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
+    some = slice(None, None, -(-len(episode) // JUDGED_SEGMENTS))
+    return episode[some], step[some]
