@@ -11,7 +11,7 @@ PIXEL_FEATURES: tuple[Layer, ...] = (
     Conv(channels=16, size=3, padding=1),
     Conv(channels=16, size=3, padding=1),
     Conv(channels=32, size=1, activation="none"),
-    SpatialSoftmax(),
+    SpatialSoftmax(log_sharpness=0.0),
 )
 """What motion and cost are read from: key points of a pooled frame at half of its resolution."""
 
