@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-ROWS = 8192
+ROWS = 2048
 """states that are predicted at a time: more do not fit a cache, and are slower"""
 
 
@@ -58,38 +58,41 @@ class RolledOut:
         return total.view(count, samples).nan_to_num(torch.inf)
 
 
-class CrossEntropy(NamedTuple):
-    """The cross-entropy method (Rubinstein 1999), as Chua et al. 2018 and the release plan.
-
-    Each iteration draws sequences around the mean, clipped at two standard deviations and at the
-    bound, and refits mean and deviation to those of least cost. The mean itself is one of them.
-    """
+class Search(NamedTuple):
+    """How hard the cross-entropy method looks, in units of actions."""
 
     iterations: int
     elites: int
     bound: float
     """of every entry of an action"""
+    std: float
+    """of every entry at first"""
     least_std: float
 
-    def __call__(
-        self,
-        forecast: Forecast,
-        mean: Float[Tensor, "N H a"],
-        std: float,
-        normal: Callable[[int], Float[Tensor, "S H a"]],
-    ) -> Float[Tensor, "N H a"]:
-        """The mean of the last elites; ``normal`` gives the draws of an iteration."""
-        spread = torch.full_like(mean, std)
-        for iteration in range(self.iterations):
-            noise = normal(iteration).clamp(-2.0, 2.0)
-            noise[0] = 0.0
-            actions = torch.addcmul(mean[:, None], spread[:, None], noise)
-            actions = actions.clamp_(-self.bound, self.bound)
-            best = forecast(actions).topk(self.elites, dim=1, largest=False).indices
-            elites = actions.take_along_dim(best[..., None, None], dim=1)
-            mean = elites.mean(dim=1)
-            spread = elites.std(dim=1, correction=0).clamp_min(self.least_std)
-        return mean
+
+def cross_entropy(
+    forecast: Forecast,
+    mean: Float[Tensor, "N H a"],
+    search: Search,
+    normal: Callable[[int], Float[Tensor, "S H a"]],
+) -> Float[Tensor, "N H a"]:
+    """The mean of the last elites (Rubinstein 1999; as Chua et al. 2018 and the authors' release).
+
+    Each iteration draws sequences around the mean, clipped at two standard deviations and at the
+    bound, and refits mean and deviation to those of least cost. The mean itself is one of them.
+    ``normal`` gives the draws of an iteration.
+    """
+    std = torch.full_like(mean, search.std)
+    for iteration in range(search.iterations):
+        noise = normal(iteration).clamp(-2.0, 2.0)
+        noise[0] = 0.0
+        actions = torch.addcmul(mean[:, None], std[:, None], noise)
+        actions = actions.clamp_(-search.bound, search.bound)
+        best = forecast(actions).topk(search.elites, dim=1, largest=False).indices
+        elites = actions.take_along_dim(best[..., None, None], dim=1)
+        mean = elites.mean(dim=1)
+        std = elites.std(dim=1, correction=0).clamp_min(search.least_std)
+    return mean
 
 
 def random_shooting(

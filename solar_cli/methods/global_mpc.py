@@ -17,11 +17,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from solar_cli.control.exploration import Exploration, smooth_noise
-from solar_cli.control.planning import CrossEntropy, RolledOut, shifted
+from solar_cli.control.planning import RolledOut, Search, cross_entropy, shifted
 from solar_cli.control.planning_policy import PlanningPolicy
 from solar_cli.control.quadratic_cost import fit_quadratic_cost
 from solar_cli.control.trajectories import Trajectories
 from solar_cli.episodes import Batch, Episodes, Experience, Policy
+from solar_cli.errors import UsageError
 from solar_cli.methods.latent import LatentLearner
 from solar_cli.models.neural import NeuralCost, NeuralDynamics, Sequences
 from solar_cli.models.neural_fit import NeuralModel, NeuralTrainer
@@ -47,6 +48,11 @@ class GlobalMpc(LatentLearner):
     ) -> None:
         self.settings = settings
         super().__init__(settings, task, streams, device, pulse)
+        if len(settings.planner.mean) not in (0, task.action.size):
+            raise UsageError(
+                f"planner.mean = {list(settings.planner.mean)}: give one number for each of the "
+                f"{task.action.size} entries of an action, or none"
+            )
         size, network = self.representation.state_size, settings.network
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(streams.seed63("network weights"))
@@ -131,14 +137,16 @@ class GlobalMpc(LatentLearner):
             draws = self.streams.generator("planning", t, iteration)
             return torch.from_numpy(smooth_noise(shape, smoothing, draws)).to(states)
 
-        search = CrossEntropy(
-            settings.iterations,
-            settings.elites,
-            action.bound,
-            settings.least_std * action.bound,
+        search = Search(
+            iterations=settings.iterations,
+            elites=settings.elites,
+            bound=action.bound,
+            std=settings.std * action.bound,
+            least_std=settings.least_std * action.bound,
         )
-        forecast = RolledOut(self.model.dynamics, self._cost, states)
-        return search(forecast, mean, settings.std * action.bound, normal)
+        return cross_entropy(
+            RolledOut(self.model.dynamics, self._cost, states), mean, search, normal
+        )
 
     def _cost(self, states: Float[Tensor, "n z"], actions: Float[Tensor, "n a"]) -> Tensor:
         """c(z) as learned, and alpha |a|^2, which is known."""

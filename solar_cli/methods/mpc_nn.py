@@ -19,6 +19,7 @@ from solar_cli.control.planning import RolledOut, random_shooting
 from solar_cli.control.planning_policy import PlanningPolicy
 from solar_cli.envs import state_cost
 from solar_cli.episodes import Experience, Policy
+from solar_cli.errors import UsageError
 from solar_cli.methods import Learner
 from solar_cli.models.basis import LatentBasis
 from solar_cli.models.neural import NeuralDynamics, Sequences
@@ -41,7 +42,12 @@ class MpcNn(Learner):
         pulse: Pulse,
     ) -> None:
         self.settings, self.task, self.streams, self.device = settings, task, streams, device
-        self.cost = state_cost(task)
+        try:
+            self.cost = state_cost(task)
+        except UsageError as error:
+            raise UsageError(
+                f"{error}; or choose global-mpc, which learns what states cost"
+            ) from error
         self.states = States(task.observation.width, device)
         width, network = task.observation.width, settings.network
         with torch.random.fork_rng(devices=[]):

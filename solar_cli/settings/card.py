@@ -16,7 +16,7 @@ from typing import Any, TypeVar, get_args
 from pydantic import BaseModel, ValidationError
 
 from solar_cli.errors import UsageError, nearest
-from solar_cli.settings.registry import method, method_names, settings_class
+from solar_cli.settings.registry import BUILT_IN, method, method_names, settings_class
 from solar_cli.settings.schema import Settings, converted, setting
 from solar_cli.settings.task import EvaluationSettings, TaskSettings
 
@@ -201,9 +201,11 @@ def resolve(
         method=validated(settings_class(entry), merged["method"], where, f"methods.{method_name}"),
     )
     if configuration.task.observation.kind not in entry.observations:
+        seen = configuration.task.observation.kind
+        others = [other.name for other in BUILT_IN if seen in other.observations]
         raise UsageError(
             f"method {method_name!r} learns from {' or '.join(entry.observations)} observations, "
-            f"task {card.name!r} gives {configuration.task.observation.kind}: choose another"
+            f"task {card.name!r} gives {seen}: choose {', '.join(others[:-1])} or {others[-1]}"
         )
     return Resolved(configuration, origins)
 

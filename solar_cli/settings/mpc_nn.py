@@ -26,6 +26,7 @@ class MpcNn(Settings):
     network: NeuralFit = setting(
         NeuralFit(
             widths=(500,),
+            activation="relu",
             batch=512,
             steps=1000,
             schedule="constant",

@@ -12,9 +12,9 @@ from solar_cli.settings.schema import Settings, setting
 class NeuralFit(Settings):
     """Networks of what an action does, and of what a state costs, and how they are trained."""
 
-    widths: tuple[Annotated[int, Field(ge=1)], ...] = setting((128, 128), "units of hidden layers")
-    activation: Literal["relu", "silu"] = setting("relu", "what follows a hidden layer")
-    steps: int = setting(1000, "gradient steps an iteration", ge=1)
+    widths: tuple[Annotated[int, Field(ge=1)], ...] = setting((64, 64), "units of hidden layers")
+    activation: Literal["relu", "silu"] = setting("silu", "what follows a hidden layer")
+    steps: int = setting(1500, "gradient steps an iteration", ge=1)
     batch: int = setting(256, "segments a gradient step", ge=1)
     unroll: int = setting(
         1, "steps of a segment: predictions are fed back, and every step's error counts", ge=1
