@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from solar_cli.control.exploration import Exploration, smooth_noise
-from solar_cli.control.planning import CrossEntropy
+from solar_cli.control.planning import Search, cross_entropy
 from solar_cli.episodes import Episodes, Evaluation, Experience, Policy
 from solar_cli.methods import Learner
 from solar_cli.models.video import CHUNK, VideoModel
@@ -50,9 +50,12 @@ class Planner:
         planner, std = settings.planner, task.exploration.std
         self.settings, self.task, self.model, self.streams = planner, task, model, streams
         self.actions = -(-planner.horizon // planner.repeat)
-        self.std = planner.std * std
-        self.search = CrossEntropy(
-            planner.iterations, planner.elites, task.action.bound, planner.least_std * std
+        self.search = Search(
+            planner.iterations,
+            planner.elites,
+            task.action.bound,
+            planner.std * std,
+            planner.least_std * std,
         )
 
     def start(self, episodes: int, stream: np.random.Generator | None) -> Planned:
@@ -80,7 +83,9 @@ class Planner:
 
         seen = torch.from_numpy(np.ascontiguousarray(observations)).to(plan.device)
         window = self.model.scaled(self.model.pooled(seen))
-        plan = self.search(lambda actions: self.forecast(window, actions), plan, self.std, normal)
+        plan = cross_entropy(
+            lambda actions: self.forecast(window, actions), plan, self.search, normal
+        )
         mean = plan[:, 0].double().cpu().numpy()
         return mean + state.noise[:, t], mean, Planned(state.noise, self.later(plan))
 

@@ -6,6 +6,7 @@ What a step draws is keyed by its number, and `VideoTrainer.state_dict` holds th
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
@@ -154,10 +155,10 @@ class VideoTrainer:
         rate = settings.learning_rate if first else settings.later_rate
         optimiser = torch.optim.Adam(model.parameters(), lr=rate, fused=True)
         if self._running is None or self._running["name"] != name:
-            self._running = {"name": name, "step": 0, "errors": (0.0, 0.0)}
+            self._running = {"name": name, "step": 0, "errors": (0.0, 0.0), "seconds": 0.0}
         elif "optimiser" in self._running:
             optimiser.load_state_dict(self._running.pop("optimiser"))
-        self._optimiser, running = optimiser, self._running
+        self._optimiser, running, last = optimiser, self._running, time.perf_counter()
         while running["step"] < steps:
             share = running["step"] / steps
             for group in optimiser.param_groups:
@@ -165,23 +166,25 @@ class VideoTrainer:
             draws = self.streams.generator(name, running["step"])
             found = errors(model, data.drawn(settings.clips, draws))
             pairs = zip(found.frames, found.still, strict=True)
-            frames = sum(wrong.sum() / still.sum().clamp_min(1e-6) for wrong, still in pairs)
-            loss = frames / len(POOLINGS) + found.costs
+            ratios = [wrong.sum() / still.sum().clamp_min(1e-6) for wrong, still in pairs]
+            frames = torch.stack(ratios).mean()
+            loss = frames + found.costs
             optimiser.zero_grad()
-            loss.backward()
+            torch.autograd.backward(loss)
             torch.nn.utils.clip_grad_norm_(model.parameters(), settings.clip, foreach=True)
             optimiser.step()
             running["step"] += 1
-            if running["step"] % PULSE_STEPS == 0 or running["step"] == steps:
-                running["errors"] = (
-                    float(frames.detach()) / len(POOLINGS),
-                    float(found.costs.detach()),
-                )
-                if not math.isfinite(sum(running["errors"])):
-                    raise Diverged(f"step {running['step']} of {name}: the loss is not finite")
-                self.pulse(f"training the video model ({name})", running["step"] / steps)
+            if running["step"] % PULSE_STEPS and running["step"] < steps:
+                continue
+            running["errors"] = (float(frames.detach()), float(found.costs.detach()))
+            if not math.isfinite(sum(running["errors"])):
+                raise Diverged(f"step {running['step']} of {name}: the loss is not finite")
+            running["seconds"] += time.perf_counter() - last
+            self.pulse(f"training the video model ({name})", running["step"] / steps)
+            last = time.perf_counter()  # a pulse may take its time to save
         self._running = self._optimiser = None
-        return dict(zip(("loss_frames", "loss_costs"), running["errors"], strict=True))
+        losses = dict(zip(("loss_frames", "loss_costs"), running["errors"], strict=True))
+        return {**losses, "seconds_training": running["seconds"]}
 
     @property
     def under_way(self) -> bool:

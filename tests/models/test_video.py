@@ -1,4 +1,4 @@
-"""The video model: pixels are carried by the distances that it says, and what it predicts counts."""
+"""The video model: pixels are carried by the distances that it says."""
 
 import itertools
 
@@ -71,7 +71,9 @@ def test_layers_move_as_scipy_shifts_them_over_the_background(distance):
     over = (seen[:, 0] - background)[:, None] * masks
     for number, frame in enumerate(steps, start=1):
         moved = [0, 0, *(number * d for d in distance)]
-        shifted = ndimage.shift(over[:, 1:].sum(dim=1).numpy(), moved, order=1, mode="grid-constant")
+        shifted = ndimage.shift(
+            over[:, 1:].sum(dim=1).numpy(), moved, order=1, mode="grid-constant"
+        )
         expected = over[:, 0].numpy() + shifted + background.numpy()
         np.testing.assert_allclose(frame.numpy(), expected, atol=1e-5)
 
@@ -116,7 +118,9 @@ def test_all_sequences_of_all_episodes_are_one_batch():
                 torch.testing.assert_close(one.cost[0], every.cost[row])
         actions[:, :, -1] += 1.0
         other = list(of.rollout(seen, actions))
-    assert all(torch.equal(a.frame, b.frame) for a, b in zip(together[:-1], other[:-1], strict=True))
+    assert all(
+        torch.equal(a.frame, b.frame) for a, b in zip(together[:-1], other[:-1], strict=True)
+    )
     assert not torch.isclose(together[-1].frame, other[-1].frame).all()
 
 

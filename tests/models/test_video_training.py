@@ -102,10 +102,16 @@ def test_what_was_not_lived_does_not_count():
 def trained(steps, pulse=lambda *_: None, batches=None) -> SimpleNamespace:
     of = VideoModel(Video(pool=2, layers=2, width=16), task())
     clips = data(batches or [episodes(20)], of)
-    of.scale_by(clips.frames[:, :-1].flatten(0, 1), *(x.flatten(0, 1) for x in (clips.actions, clips.costs)))
+    of.scale_by(
+        clips.frames[:, :-1].flatten(0, 1), *(x.flatten(0, 1) for x in (clips.actions, clips.costs))
+    )
     settings = VideoTraining(steps=steps, clips=16, learning_rate=1e-2)
     trainer = VideoTrainer(settings, Streams(0), "cpu", pulse)
     return SimpleNamespace(model=of, data=clips, trainer=trainer)
+
+
+def losses(metrics: dict[str, float]) -> dict[str, float]:
+    return {name: value for name, value in metrics.items() if not name.startswith("seconds_")}
 
 
 def test_it_learns_where_things_go_and_what_they_cost():
@@ -136,7 +142,8 @@ def test_training_stopped_at_any_pulse_goes_on_with_the_same_bits(monkeypatch):
         resumed.trainer.load_state_dict(running)
         assert resumed.trainer.under_way
         assert digest(resumed.trainer.state_dict()) == digest(running)
-        assert resumed.trainer.fit("a", resumed.model, resumed.data, first=True) == expected
+        found = resumed.trainer.fit("a", resumed.model, resumed.data, first=True)
+        assert losses(found) == losses(expected)
         assert digest(resumed.model.state_dict()) == digest(whole.model.state_dict())
         assert not resumed.trainer.under_way
 
