@@ -3,6 +3,11 @@
 A network predicts the next frames from those seen and the actions, another one what they cost; at
 every step the cross-entropy method finds actions whose predicted frames cost least.
 
+The paper says no more of it than that. Finn and Levine predict with a recurrent convolutional
+network that moves its last prediction, and bring marked pixels to where a person wants them; as the
+paper says, here a cost is learned instead. How ours moves pixels, and why, is in `models/video.py`.
+Training looks as far ahead as plans do.
+
 Axes: N episodes, S action sequences, H steps ahead, P actions of a plan, a entries of an action.
 """
 
@@ -180,8 +185,8 @@ class PixelMpc(Learner):
         found = errors(self.model, data.drawn(JUDGED_CLIPS, self.streams.generator("judging")))
         ratio = found.frames[0] / found.still[0].clamp_min(1e-6)
         return {
-            "frame_error_1": float(ratio[0]),
-            f"frame_error_{len(ratio)}": float(ratio[-1]),
+            "one_step_frame_error": float(ratio[0]),
+            "horizon_frame_error": float(ratio[-1]),
             "cost_r2": 1 - float(found.costs),
         }
 

@@ -5,8 +5,10 @@ by a distance that a network reads off the window of frames and the action, and 
 shows where nothing is left. So pixels are carried, not drawn anew: a blob that moves stays a blob.
 What is predicted goes into the window, for the next step and for the cost.
 
-Finn et al. 2016 (CDNA) move the frame before; moved again and again, it would blur. Here the
-distances add up, and every frame is the seen one moved once.
+Finn et al. 2016 (CDNA) move the frame before, and mask what comes of it: moved again and again, a
+frame blurs, and every step of every action sequence pays for new masks. Here the distances add up,
+every frame is the seen one moved once, and its masks are made once a plan. The price: a layer moves
+as a whole, so that what turns does so in pieces, and layers that cross shine through each other.
 
 Axes: N episodes or clips, S action sequences of each, H steps ahead, W frames of a window, K layers
 that move, C channels and h x w pooled pixels of a frame, f features of one, a entries of an action.

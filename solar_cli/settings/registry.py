@@ -36,6 +36,8 @@ class MethodEntry:
     """kinds of observation it can learn from"""
     needs: Literal["costs", "true cost"] = "costs"
     """whether it sees the collected costs only, or the task's cost function"""
+    deviations: str = ""
+    """where it departs from its source, and why"""
 
 
 BUILT_IN = (
@@ -81,6 +83,12 @@ BUILT_IN = (
         settings="solar_cli.settings.pixel_mpc:PixelMpc",
         learner="solar_cli.methods.pixel_mpc:PixelMpc",
         observations=("image",),
+        deviations="The paper gives no details. Frames are predicted after pooling, for speed. The "
+        "layers of a frame are its own soft masks, made once from the frame seen and moved by "
+        "distances that add up, where Finn and Levine move the last prediction again at every step "
+        "and blur it; a learned background fills what they leave, and there is no recurrent state: "
+        "what is predicted goes back into the window. The planner minimises a learned cost of "
+        "predicted frames and the known cost of actions, not the distance of marked pixels.",
     ),
     MethodEntry(
         name="zero",

@@ -181,7 +181,7 @@ def test_it_says_how_well_it_predicts_and_shows_it(tmp_path):
     one.iterate(1, 1)
     before = one.bits()
     found = one.learner.diagnose(evaluation)
-    assert list(found) == ["frame_error_1", "frame_error_4", "cost_r2"]
+    assert list(found) == ["one_step_frame_error", "horizon_frame_error", "cost_r2"]
     assert np.isfinite(list(found.values())).all()
     ahead = one.learner.foresee(episodes)
     assert ahead.shape == (5, 4, *episodes.frames.shape[2:])
@@ -201,8 +201,8 @@ def test_a_model_that_copies_shows_copies_and_has_their_error(tmp_path):
         np.testing.assert_allclose(ahead[:, h].astype(int), first.numpy(), atol=1)
     judged = Evaluation(episodes, {}, np.empty((len(episodes), 7, 0)))
     found = one.learner.diagnose(judged)
-    assert found["frame_error_1"] == pytest.approx(1.0)
-    assert found["frame_error_4"] == pytest.approx(1.0)
+    assert found["one_step_frame_error"] == pytest.approx(1.0)
+    assert found["horizon_frame_error"] == pytest.approx(1.0)
 
 
 def test_what_a_task_shows_after_the_end_does_not_matter(tmp_path):
