@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solar_cli.episodes import Evaluation
-from solar_cli.methods import Learner
+from solar_cli.methods import Foreseeing, Learner
 from solar_cli.store.store import Store
 
 SHOWN = 6
 """episodes of the animation"""
 RECONSTRUCTED = 8
-"""frames beside their reconstructions"""
+"""frames beside their reconstructions, or beside predictions"""
 POINTS = 2000
 """latents, at most"""
 
@@ -35,11 +35,12 @@ def exhibit(
     of: Learner,
 ) -> None:
     """Store the artifacts ``animation``, of a task that can be ``shown``, and of a learner that has
-    them the two others.
+    them the others.
 
     ``animation.npz`` has ``frames`` (K, T+1, C, H, W) uint8; ``reconstruction.npz`` has
-    ``original`` and ``reconstruction`` (M, *frame); ``latents.npz`` has ``latents`` (n, d), and
-    where the simulator was at each, ``truth`` (n, k) with its ``names`` (k,).
+    ``original`` and ``reconstruction`` (M, *frame); ``prediction.npz`` has ``original`` and
+    ``prediction`` (M, *frame), steps after the start of one episode; ``latents.npz`` has
+    ``latents`` (n, d), and where the simulator was at each, ``truth`` (n, k) with its ``names``.
     """
     episodes = judged.episodes[:SHOWN]
     exhibits: dict[str, Arrays] = {} if shown is None else {"animation": {"frames": shown}}
@@ -50,6 +51,12 @@ def exhibit(
         exhibits["reconstruction"] = {
             "original": episodes.frames[rows],
             "reconstruction": seen[rows],
+        }
+    if isinstance(of, Foreseeing) and (ahead := of.foresee(episodes[:1])) is not None:
+        some = _spread(ahead.shape[1], RECONSTRUCTED)
+        exhibits["prediction"] = {
+            "original": episodes.frames[0, 1:][some],
+            "prediction": ahead[0][some],
         }
     if judged.truth_names and (latents := of.encode(judged.episodes)) is not None:
         exhibits["latents"] = _points(judged, latents)

@@ -5,7 +5,7 @@ No method is imported here: `solar_cli.settings.registry` finds its module when 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from solar_cli.pulse import Diverged, Pulse
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from solar_cli.episodes import Episodes, Evaluation, Experience, Policy
 
-__all__ = ["Diverged", "Learner", "Pulse"]
+__all__ = ["Diverged", "Foreseeing", "Learner", "Pulse"]
 
 
 class Learner(Protocol):
@@ -54,3 +54,14 @@ class Learner(Protocol):
     def reconstruct(self, episodes: Episodes) -> NDArray[Any] | None:
         """Frames as the model sees them, like ``episodes.frames``; None for a method without."""
         return None
+
+
+@runtime_checkable
+class Foreseeing(Protocol):
+    """What a learner may have besides, whose model predicts frames."""
+
+    def foresee(self, episodes: Episodes) -> NDArray[Any] | None:
+        """Frames (N, H, *frame) 1 to H steps after the first of each episode, as in its frames.
+
+        Predicted from that one and the actions; None before there is a model.
+        """

@@ -6,7 +6,7 @@ which the first d are its newest block, a entries of an action.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 

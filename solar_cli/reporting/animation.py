@@ -114,7 +114,7 @@ def _gif(shown: Pictures) -> bytes:
 def reconstructions(
     settings: TaskSettings, original: NDArray[Any], reconstruction: NDArray[Any]
 ) -> bytes:
-    """A PNG with the originals above their reconstructions; both (M, C, H, W) in 0 to 255."""
+    """A PNG with the originals above what a model made of them; both (M, C, H, W) in 0 to 255."""
     above, below = (
         _side_by_side(_enlarged(settings, frames)[:, None])[0]
         for frames in (original, reconstruction)

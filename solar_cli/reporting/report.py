@@ -39,9 +39,9 @@ def report(store: Store, out: Path) -> Report:
 
     ``out`` gets ``index.html`` and, for each problem, a folder with ``curve.{png,svg,pdf}``,
     ``table.{md,csv,tex}``, ``evaluations.csv`` (the number behind each point), and for each method
-    ``NAME.gif``, ``NAME-reconstruction.png`` and ``NAME-latents.png``. An earlier report there is
-    replaced; other files are left alone. Raises `SolarError` for a store without evaluations,
-    `UsageError` for ``out``.
+    ``NAME.gif``, ``NAME-reconstruction.png``, ``NAME-prediction.png`` and ``NAME-latents.png``, as
+    far as there is such a thing. An earlier report there is replaced; other files are left alone.
+    Raises `SolarError` for a store without evaluations, `UsageError` for ``out``.
     """
     found = [problem for problem in problems(store) if problem.curves]
     if not found:
@@ -93,6 +93,8 @@ def _files(part: Section) -> dict[str, bytes]:
             files[f"{name}.gif"] = exhibit.animation
         if exhibit.reconstruction is not None:
             files[f"{name}-reconstruction.png"] = exhibit.reconstruction
+        if exhibit.prediction is not None:
+            files[f"{name}-prediction.png"] = exhibit.prediction
         if exhibit.latents is not None:
             files[f"{name}-latents.png"] = exhibit.latents
     return files

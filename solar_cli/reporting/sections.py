@@ -25,7 +25,7 @@ from solar_cli.wording import counted
 MEMORY = "peak_memory_bytes"
 """Metric of the training split, where a worker measures it."""
 
-PICTURES = ("animation", "reconstruction", "latents")
+PICTURES = ("animation", "reconstruction", "prediction", "latents")
 """Kinds of artifacts that are drawn."""
 
 Artifacts = Mapping[tuple[str, str], ArtifactRecord]
@@ -40,6 +40,7 @@ class Exhibit:
     seed: int
     animation: bytes | None
     reconstruction: bytes | None
+    prediction: bytes | None
     latents: bytes | None
     damage: tuple[str, ...]
     """why a stored picture is not shown"""
@@ -140,8 +141,8 @@ def _draw(settings: TaskSettings, kind: str, artifact: ArtifactRecord | None) ->
             frames = stored["frames"]
             # Of a task seen as a state, older versions stored states: (K, T+1, S).
             return animation(settings, frames) if frames.ndim == 5 else None
-        if kind == "reconstruction":
-            return reconstructions(settings, stored["original"], stored["reconstruction"])
+        if kind in ("reconstruction", "prediction"):
+            return reconstructions(settings, stored["original"], stored[kind])
         space = latent_space(stored["latents"], stored["truth"], stored["names"].tolist())
         return None if space is None else figures.render(space, "png")
     except (KeyError, ValueError, IndexError) as error:

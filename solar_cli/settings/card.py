@@ -125,8 +125,10 @@ def _read(path: Path) -> Card:
             )
     for variant in card.variants:
         for name in tables.get("methods", {}):
-            # Methods of packages that are not installed here are left to those who have them.
-            if name in method_names() and _changes(card, variant, name):
+            # Methods of packages that are not installed here are left to those who have them, and
+            # those that cannot learn from what this card shows to the card that it extends.
+            known = name in method_names() and _learns_from(card, name)
+            if known and _changes(card, variant, name):
                 try:
                     resolve(card, name, variant)
                 except UsageError as error:
@@ -220,6 +222,10 @@ def _own_defaults(settings: type[BaseModel]) -> Table:
         for name, field in settings.model_fields.items()
         if isinstance(field.default, BaseModel) and field.default.model_fields_set
     }
+
+
+def _learns_from(card: Card, method_name: str) -> bool:
+    return card.task.observation.kind in method(method_name).observations
 
 
 def _changes(card: Card, variant: str, method_name: str) -> bool:

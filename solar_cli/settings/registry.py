@@ -108,6 +108,21 @@ BUILT_IN = (
         "ours: 1000 an iteration, and the best by held-out episodes is kept",
     ),
     MethodEntry(
+        name="pixel-mpc",
+        summary="Video prediction and a cost network in pixel space, and the cross-entropy method "
+        "under them at every step.",
+        source="section 6, pixel space model; Finn and Levine 2017",
+        settings="solar_cli.settings.pixel_mpc:PixelMpc",
+        learner="solar_cli.methods.pixel_mpc:PixelMpc",
+        observations=("image",),
+        deviations="The paper gives no details. Frames are predicted after pooling, for speed. The "
+        "layers of a frame are its own soft masks, made once from the frame seen and moved by "
+        "distances that add up, where Finn and Levine move the last prediction again at every step "
+        "and blur it; a learned background fills what they leave, and there is no recurrent state: "
+        "what is predicted goes back into the window. The planner minimises a learned cost of "
+        "predicted frames and the known cost of actions, not the distance of marked pixels.",
+    ),
+    MethodEntry(
         name="zero",
         summary="A reference: no action at all.",
         source="reference policy",

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from solar_cli.episodes import Episodes, Evaluation
-from solar_cli.experiment.exhibits import POINTS, exhibit
+from solar_cli.experiment.exhibits import POINTS, RECONSTRUCTED, exhibit
 from solar_cli.settings import Cell
 from solar_cli.store.owner import Owner
 from solar_cli.store.store import Store
@@ -85,3 +85,27 @@ def test_of_many_latents_some_are_kept_from_the_first_to_the_last(kept) -> None:
 )
 def test_without_latents_or_truth_there_are_none(kept, evaluation, learner) -> None:
     assert set(kept(evaluation, learner)) == {"animation"}
+
+
+class Foretelling(Unseeing):
+    """Foresees numbers that are one too large, 20 steps ahead."""
+
+    def foresee(self, episodes: Episodes) -> np.ndarray:
+        return episodes.frames[:, 1:21] + 1
+
+
+def test_predictions_stand_beside_what_came_of_the_first_episode(kept) -> None:
+    found = kept(judged(), Foretelling())["prediction"]
+    steps = found["original"][:, 0]
+    assert len(steps) == RECONSTRUCTED
+    assert (steps[0], steps[-1]) == (1, 20)
+    assert (np.diff(steps) > 0).all()
+    np.testing.assert_array_equal(found["prediction"][:, 0], steps + 1)
+
+
+def test_before_there_is_a_model_nothing_is_foreseen(kept) -> None:
+    class Silent(Foretelling):
+        def foresee(self, episodes: Episodes) -> None:
+            return None
+
+    assert set(kept(judged(), Silent())) == {"animation"}

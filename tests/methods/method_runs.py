@@ -1,4 +1,4 @@
-"""A local method at work on the smoke variant of nav, made smaller still."""
+"""A method at work on the smoke variant of nav, made smaller still."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ SMALL: dict[str, tuple[str, ...]] = {
     "lqr-flm": ('cost_fit.per_time="never"',),
     "global-mpc": ("training.steps=12", "network.steps=12", "planner.horizon=3"),
     "mpc-nn": ("network.steps=12",),
+    "pixel-mpc": (),
     "random": (),
     "zero": (),
 }

@@ -103,7 +103,7 @@ def compute(
 
 
 def add_pictures(store: Store, of: Cell, attempt: int, frames: NDArray[Any] | None = None) -> None:
-    """Three episodes of four frames each, two reconstructed frames, and twelve latents."""
+    """Three episodes of four frames, two of them reconstructed, two predicted; twelve latents."""
     stream = np.random.default_rng(of.seed)
     if frames is None:
         frames = stream.integers(0, 50, (3, 4, 2, 32, 32), dtype=np.uint8)
@@ -112,6 +112,7 @@ def add_pictures(store: Store, of: Cell, attempt: int, frames: NDArray[Any] | No
     arrays = {
         "animation": {"frames": frames, "kind": np.array("image")},
         "reconstruction": {"original": frames[0, :2], "reconstruction": frames[0, :2] / 2},
+        "prediction": {"original": frames[0, 1:3], "prediction": frames[0, :2]},
         "latents": {
             "latents": stream.normal(size=(12, 4)).astype(np.float32),
             "truth": stream.normal(size=(12, 2)).astype(np.float32),

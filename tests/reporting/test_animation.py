@@ -140,6 +140,7 @@ def test_the_seed_that_is_shown_is_the_one_in_the_middle(tmp_path):
     assert shown.seed == 2
     assert shown.animation
     assert shown.reconstruction
+    assert shown.prediction
     assert shown.latents
     assert shown.damage == ()
 
@@ -161,7 +162,8 @@ def test_of_a_state_task_the_policy_is_shown_and_nothing_of_its_model(tmp_path, 
         assert shown is None
         return
     assert shown.animation == animation(drawable(settings, 40), frames)
-    assert (shown.reconstruction, shown.latents, shown.damage) == (None, None, ())
+    assert (shown.reconstruction, shown.prediction, shown.latents) == (None, None, None)
+    assert shown.damage == ()
 
 
 def test_a_damaged_or_missing_file_is_said_and_the_rest_is_shown(tmp_path):

@@ -74,6 +74,7 @@ def test_a_report_has_its_files(made):
         "nav/evaluations.csv",
         "nav/solar.gif",
         "nav/solar-reconstruction.png",
+        "nav/solar-prediction.png",
         "nav/solar-latents.png",
     }
     assert all(path.stat().st_size > 0 for path in written.paths)
