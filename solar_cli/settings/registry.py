@@ -66,6 +66,22 @@ BUILT_IN = (
         needs="true cost",
     ),
     MethodEntry(
+        name="ppo",
+        summary="Model-free: a policy network improved on its own episodes, by clipped likelihood "
+        "ratios (Stable-Baselines3).",
+        source="Schulman et al. 2017 (section 6)",
+        settings="solar_cli.settings.on_policy:Ppo",
+        learner="solar_cli.methods.ppo:Ppo",
+    ),
+    MethodEntry(
+        name="trpo",
+        summary="Model-free: a policy network improved on its own episodes, by natural gradients "
+        "within a KL bound (sb3-contrib).",
+        source="Schulman et al. 2015 (section 6)",
+        settings="solar_cli.settings.on_policy:Trpo",
+        learner="solar_cli.methods.trpo:Trpo",
+    ),
+    MethodEntry(
         name="zero",
         summary="A reference: no action at all.",
         source="reference policy",

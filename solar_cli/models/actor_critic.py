@@ -1,0 +1,87 @@
+"""Policies of Stable-Baselines3 on a card's layers, sampled with noise that was drawn before."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from jaxtyping import Float
+from numpy.typing import NDArray
+from stable_baselines3.common.distributions import DiagGaussianDistribution
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import Tensor, nn
+
+from solar_cli.models.networks import build
+from solar_cli.settings.on_policy import ActorCritic
+
+CONSTANT = 1e-6
+"""An entry of a state whose std is smaller keeps its scale."""
+
+
+class Layers(BaseFeaturesExtractor):
+    """A card's layers on an observation; entries of a state are standardised first.
+
+    Stable-Baselines3 has images in [0, 1] before they come here.
+    """
+
+    mean: Tensor
+    scale: Tensor
+
+    def __init__(self, observation_space: spaces.Box, settings: ActorCritic) -> None:
+        shape = observation_space.shape
+        body, after = build(settings.layers, shape)
+        super().__init__(observation_space, math.prod(after))
+        self.body = nn.Sequential(*body, nn.Flatten()) if len(after) > 1 else body
+        self.of_states = len(shape) == 1
+        if self.of_states:
+            self.register_buffer("mean", torch.zeros(shape))
+            self.register_buffer("scale", torch.ones(shape))
+
+    def forward(self, observations: Float[Tensor, "n *shape"]) -> Float[Tensor, "n m"]:
+        """What is read from them."""
+        if self.of_states:
+            observations = (observations - self.mean) / self.scale
+        features: Tensor = self.body(observations)
+        return features
+
+
+class PredrawnGaussian(DiagGaussianDistribution):
+    """Stable-Baselines3's Gaussian; what it samples is made of ``noise``, not of a global stream."""
+
+    noise: Float[Tensor, "n a"]
+
+    def sample(self) -> Float[Tensor, "n a"]:
+        """Mean + std x noise."""
+        drawn: Tensor = self.distribution.mean + self.distribution.stddev * self.noise
+        return drawn
+
+
+class ActorCriticOfLayers(ActorCriticPolicy):
+    """Stable-Baselines3's policy and value, as a card describes them, for actions in [-1, 1]."""
+
+    action_dist: PredrawnGaussian
+
+    def __init__(self, *args: Any, settings: ActorCritic, **kwargs: Any) -> None:
+        heads = list(settings.heads)
+        super().__init__(
+            *args,
+            net_arch={"pi": heads, "vf": heads},
+            log_std_init=math.log(settings.std),
+            features_extractor_class=Layers,
+            features_extractor_kwargs={"settings": settings},
+            share_features_extractor=settings.shared,
+            **kwargs,
+        )
+        self.action_dist = PredrawnGaussian(int(np.prod(self.action_space.shape or ())))
+
+    def standardise_by(self, states: NDArray[np.float32]) -> None:
+        """Take mean and scale of entries from states (n, S); images have theirs."""
+        for part in self.modules():
+            if isinstance(part, Layers) and part.of_states:
+                scale = states.std(axis=0)
+                part.mean.copy_(torch.from_numpy(states.mean(axis=0)))
+                part.scale.copy_(torch.from_numpy(np.where(scale > CONSTANT, scale, 1.0)))
