@@ -18,7 +18,9 @@ class Ppo(OnPolicyLearner):
 
     def algorithm(self, **shared: Any) -> OnPolicyAlgorithm:
         """As `OnPolicyLearner.algorithm`."""
+        stop = self.settings.stop_kl
         return PPO(
+            target_kl=None if stop == "never" else stop,
             n_epochs=self.settings.epochs,
             clip_range=self.settings.clip,
             ent_coef=self.settings.entropy,

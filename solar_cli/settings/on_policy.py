@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Annotated, Literal
+
+from pydantic import Field
+
 from solar_cli.settings.local import Budget
 from solar_cli.settings.networks import Layer
 from solar_cli.settings.networks import Linear as LinearLayer
@@ -15,7 +19,9 @@ class ActorCritic(Settings):
         (LinearLayer(width=64),), "layers on the window's stacked frames", min_length=1
     )
     heads: tuple[int, ...] = setting((64,), "tanh units above them, of the mean and of the value")
-    shared: bool = setting(True, "mean and value are read from the same layers, or each from own")
+    shared: bool = setting(
+        False, "mean and value are read from the same layers, or each from its own"
+    )
     std: float = setting(0.5, "initial std of every action entry, over the bound", gt=0)
 
 
@@ -40,6 +46,9 @@ class Ppo(OnPolicy):
     """PPO (Schulman et al. 2017)."""
 
     epochs: int = setting(4, "passes over a rollout", ge=1)
+    stop_kl: Annotated[float, Field(gt=0)] | Literal["never"] = setting(
+        0.02, "nats after which an update takes no further step (Stable-Baselines3's target_kl)"
+    )
     clip: float = setting(0.2, "of the likelihood ratio", "Stable-Baselines3", gt=0)
     entropy: float = setting(0.0, "weight of the entropy", "Stable-Baselines3", ge=0)
     value_weight: float = setting(0.5, "weight of the value's loss", "Stable-Baselines3", ge=0)
