@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from solar_cli.experiment.matrix import Action, Plan
 from solar_cli.settings import Cell
 from solar_cli.settings.local import LocalMethod
+from solar_cli.settings.on_policy import OnPolicy
 from solar_cli.store.records import CellRecord, State
 
 if TYPE_CHECKING:
@@ -51,7 +52,7 @@ def memory_needs(cell: Cell) -> list[Need]:
 
     Episodes of the last evaluation and of the first batch; of a local method a minibatch's frames,
     a matrix over states for each time step, and the weights of all pairs of time steps that
-    posterior inference uses.
+    posterior inference uses; of a method on policy the windows of a rollout.
     """
     task, method = cell.configuration.task, cell.configuration.method
     judged = cell.configuration.evaluation.episodes
@@ -75,6 +76,10 @@ def memory_needs(cell: Cell) -> list[Need]:
         if method.local_fit.method == "posterior":
             pairs = task.horizon**2 * FLOAT_BYTES
             needs.append(Need(pairs, "weights of neighbouring time steps", ("task.horizon",)))
+    if isinstance(method, OnPolicy):
+        every = method.rollout * (episode + task.horizon * seen.window * frame)
+        named = (f"methods.{cell.method}.rollout", *sizes)
+        needs.append(Need(every, "a rollout with all its windows", named))
     return needs
 
 

@@ -42,8 +42,17 @@ from solar_cli.streams import Streams
 
 LEAST_RATE = 0.05
 """of the first learning rate: what is left when the card's horizon is over"""
-LOGGED = "train/"
-"""how the numbers begin that Stable-Baselines3 logs of an update"""
+LOGGED = {
+    "approx_kl": "policy_kl",
+    "kl_divergence_loss": "policy_kl",
+    "clip_fraction": "clip_fraction",
+    "entropy_loss": "minus_entropy",
+    "explained_variance": "explained_variance",
+    "is_line_search_success": "line_search_success",
+    "learning_rate": "learning_rate",
+    "value_loss": "value_loss",
+}
+"""what Stable-Baselines3 logs of an update -> metric"""
 
 
 class OnPolicyLearner(Learner, ABC):
@@ -138,10 +147,12 @@ class OnPolicyLearner(Learner, ABC):
             raise Diverged(f"update {self.rollouts + 1}: {error}") from error
         if not self._finite():
             raise Diverged(f"the policy after update {self.rollouts + 1} is not finite")
-        for name, value in model.logger.name_to_value.items():
-            if name.startswith(LOGGED) and name != "train/n_updates":
-                name = name.removeprefix(LOGGED)
-                self.sums[name] = self.sums.get(name, 0.0) + float(value)
+        logged = model.logger.name_to_value
+        said = {LOGGED.get(name.removeprefix("train/")): value for name, value in logged.items()}
+        said["policy_std"] = float(self.network.log_std.detach().exp().mean()) * self.task.action.bound
+        for metric, value in said.items():
+            if metric is not None:
+                self.sums[metric] = self.sums.get(metric, 0.0) + float(value)
 
     def _finite(self) -> bool:
         return all(bool(torch.isfinite(one).all()) for one in self.network.parameters())

@@ -19,11 +19,13 @@ from solar_cli.models.networks import build
 from solar_cli.settings.on_policy import ActorCritic
 
 CONSTANT = 1e-6
-"""An entry of a state whose std is smaller keeps its scale."""
+"""What has a smaller std keeps its scale."""
+CHUNK = 64
+"""windows in floating point at once: bounds memory"""
 
 
 class Layers(BaseFeaturesExtractor):
-    """A card's layers on an observation; entries of a state are standardised first.
+    """A card's layers on observations, from which the first ones' mean may be taken.
 
     Stable-Baselines3 has images in [0, 1] before they come here.
     """
@@ -36,14 +38,26 @@ class Layers(BaseFeaturesExtractor):
         body, after = build(settings.layers, shape)
         super().__init__(observation_space, math.prod(after))
         self.body = nn.Sequential(*body, nn.Flatten()) if len(after) > 1 else body
-        self.of_states = len(shape) == 1
-        if self.of_states:
+        self.standardises = settings.input == "standardised"
+        if self.standardises:
             self.register_buffer("mean", torch.zeros(shape))
-            self.register_buffer("scale", torch.ones(shape))
+            self.register_buffer("scale", torch.ones(shape if len(shape) == 1 else ()))
+
+    def standardise_by(self, windows: NDArray[Any]) -> None:
+        """Mean and scale of (n, *shape): of an image one scale, of a state one an entry."""
+        largest = 255.0 if windows.dtype == np.uint8 else 1.0
+        mean = windows.mean(axis=0, dtype=np.float64)
+        chunks = np.array_split(windows, -(-len(windows) // CHUNK))
+        variance = sum(np.square(chunk - mean).sum(axis=0) for chunk in chunks) / len(windows)
+        if largest > 1.0:  # an entry of a state has a unit of its own, a pixel has not
+            variance = variance.mean()
+        scale = np.sqrt(variance) / largest
+        self.mean.copy_(torch.from_numpy(mean / largest))
+        self.scale.copy_(torch.as_tensor(np.where(scale > CONSTANT, scale, 1.0)))
 
     def forward(self, observations: Float[Tensor, "n *shape"]) -> Float[Tensor, "n m"]:
         """What is read from them."""
-        if self.of_states:
+        if self.standardises:
             observations = (observations - self.mean) / self.scale
         features: Tensor = self.body(observations)
         return features
@@ -78,10 +92,8 @@ class ActorCriticOfLayers(ActorCriticPolicy):
         )
         self.action_dist = PredrawnGaussian(int(np.prod(self.action_space.shape or ())))
 
-    def standardise_by(self, states: NDArray[np.float32]) -> None:
-        """Take mean and scale of entries from states (n, S); images have theirs."""
+    def standardise_by(self, windows: NDArray[Any]) -> None:
+        """Take mean and scale from observations (n, *shape), where the card says so."""
         for part in self.modules():
-            if isinstance(part, Layers) and part.of_states:
-                scale = states.std(axis=0)
-                part.mean.copy_(torch.from_numpy(states.mean(axis=0)))
-                part.scale.copy_(torch.from_numpy(np.where(scale > CONSTANT, scale, 1.0)))
+            if isinstance(part, Layers) and part.standardises:
+                part.standardise_by(windows)

@@ -18,6 +18,9 @@ class ActorCritic(Settings):
     layers: tuple[Layer, ...] = setting(
         (LinearLayer(width=64),), "layers on the window's stacked frames", min_length=1
     )
+    input: Literal["standardised", "unit"] = setting(
+        "standardised", "by the first rollout's mean and std; or images in [0, 1], states as seen"
+    )
     heads: tuple[int, ...] = setting((64,), "tanh units above them, of the mean and of the value")
     shared: bool = setting(
         False, "mean and value are read from the same layers, or each from its own"

@@ -21,6 +21,8 @@ class Run:
     ``costs`` changes those of an iteration, given its number.
     """
 
+    small: tuple[str, ...] = ("training.steps=12", 'cost_fit.per_time="never"')
+
     def __init__(
         self,
         folder: Path,
@@ -31,8 +33,7 @@ class Run:
         wrap: Callable[[Any], Any] = lambda task: task,
         costs: Callable[[int, np.ndarray], np.ndarray] | None = None,
     ) -> None:
-        small = ("training.steps=12", 'cost_fit.per_time="never"', *sets)
-        changes = ["task.horizon=6", *(f"methods.{name}.{text}" for text in small)]
+        changes = ["task.horizon=6", *(f"methods.{name}.{text}" for text in (*self.small, *sets))]
         [cell] = cells(load_card("nav"), name, [seed], "smoke", changes)
         self.configuration = cell.configuration
         streams, task = Streams(seed), cell.configuration.task
