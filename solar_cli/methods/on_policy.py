@@ -155,7 +155,9 @@ class OnPolicyLearner(Learner, ABC):
                 self.sums[metric] = self.sums.get(metric, 0.0) + float(value)
 
     def _finite(self) -> bool:
-        return all(bool(torch.isfinite(one).all()) for one in self.network.parameters())
+        stds = self.network.log_std.exp()  # of a finite log it may be zero or infinite
+        numbers = [*self.network.parameters(), stds, 1 / stds]
+        return all(bool(torch.isfinite(one).all()) for one in numbers)
 
     def buffer(self, episodes: Episodes, actor: Actor) -> RolloutBuffer:
         """The live steps of a rollout, episode by episode, with their advantages."""

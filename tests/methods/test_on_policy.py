@@ -22,7 +22,9 @@ from solar_cli.envs.stable_baselines import BatchedVecEnv
 from solar_cli.episodes import Episodes, evaluate, roll_out
 from solar_cli.methods import Diverged
 from solar_cli.methods.on_policy import LEAST_RATE, evaluated_after, seeded
-from solar_cli.settings import TaskSettings, load_card
+from solar_cli.methods.ppo import Ppo
+from solar_cli.settings import TaskSettings, load, load_card, method, resolve
+from solar_cli.settings.on_policy import Ppo as PpoSettings
 from solar_cli.streams import Streams
 
 ROLLOUT, HORIZON = 4, 6
@@ -92,7 +94,7 @@ def plain(name, settings, shared, rollouts, card, monkeypatch):
     env = BatchedVecEnv(card, ROLLOUT)
     own = {
         "ppo": dict(n_epochs=4, clip_range=0.2, target_kl=0.02),
-        "trpo": dict(sub_sampling_factor=4, cg_max_steps=10),
+        "trpo": dict(sub_sampling_factor=2, cg_max_steps=10, cg_damping=1.0),
     }
     torch.manual_seed(Streams(0).under("learner", "weights").seed63("torch"))
     model = {"ppo": PPO, "trpo": TRPO}[name](
@@ -127,13 +129,19 @@ def short_card(tmp_path):
     return str(path)
 
 
+@pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
 @both
 @pytest.mark.parametrize("shared", ["true", "false"])
 def test_plain_stable_baselines_learns_the_same_weights(
     tmp_path, monkeypatch, short_card, name, shared
 ):
-    """Up to the rounding of another batch size; and the learning rate falls in both."""
-    sets = (f"network.shared={shared}", "reward_scale=1.0", "horizon=60")
+    """Up to the rounding of another batch size; and the learning rate falls in both.
+
+    TRPO's Fisher matrix is well damped: else ten iterations of conjugate gradients make of a
+    rounding error in 24 samples what they like.
+    """
+    sets = [f"network.shared={shared}", "reward_scale=1.0", "horizon=60"]
+    sets += ["every=2", "damping=1.0"] if name == "trpo" else []
     run = OnPolicyRun(tmp_path / "ours", name, *sets)
     first = [one.detach().clone() for one in run.learner.network.parameters()]
     run.iterate(1, 3)
@@ -143,8 +151,8 @@ def test_plain_stable_baselines_learns_the_same_weights(
     assert len(found) == len(expected)
     for before, own, after, wanted in zip(first, started, found, expected, strict=True):
         assert torch.equal(before, own)
-        torch.testing.assert_close(after, wanted, rtol=1e-4, atol=1e-6)
-        assert name == "trpo" or not torch.allclose(after, before, rtol=1e-4, atol=1e-6)
+        torch.testing.assert_close(after, wanted, rtol=1e-4, atol=3e-6)
+        assert not torch.allclose(after, before, rtol=1e-4, atol=3e-6)
 
 
 # A rollout
@@ -165,9 +173,6 @@ def hand_made(lengths, frames=None):
 
 def learner_of_states(**sets):
     """A learner of PPO on a task of states with a window of two."""
-    from solar_cli.methods.ppo import Ppo
-    from solar_cli.settings.on_policy import Ppo as Settings
-
     task = TaskSettings.model_validate(
         {
             "simulator": "none",
@@ -178,7 +183,7 @@ def learner_of_states(**sets):
         }
     )
     budget = {"desk": 8, "full": 8}
-    settings = Settings(rollout=4, horizon=100, budget=budget, minibatch=4, **sets)
+    settings = PpoSettings(rollout=4, horizon=100, budget=budget, minibatch=4, **sets)
     return Ppo(settings, task, Streams(0), "cpu", lambda *_: None)
 
 
@@ -236,11 +241,9 @@ def test_a_buffer_holds_live_steps_with_what_was_seen_drawn_and_thought_of():
 @pytest.mark.parametrize("at_once", [None, 2])
 def test_an_actor_notes_what_it_drew_before_clipping(at_once):
     """Of groups of episodes, too; what is executed is that times the bound, clipped."""
-    [settings] = {load_card("nav").task}
-    settings = settings.model_copy(update={"horizon": 5})
+    settings = load_card("nav").task.model_copy(update={"horizon": 5})
     task = build_task(settings)
     task.at_once = at_once
-    learner = Run.__new__(Run)
     learner = learner_of("ppo", settings)
     actor, streams = Actor(learner.network, settings), Streams(2)
     resets = [streams.generator("reset", i) for i in range(4)]
@@ -257,25 +260,53 @@ def test_an_actor_notes_what_it_drew_before_clipping(at_once):
     np.testing.assert_allclose(taken.actions, drawn, rtol=1e-5, atol=1e-6)
 
 
-def learner_of(name, task):
-    from solar_cli.settings import load, method, resolve
-
-    settings = resolve(load_card("nav"), name, "smoke").configuration.method
+def learner_of(name, task, *sets):
+    sets = [f"methods.{name}.{text}" for text in sets]
+    settings = resolve(load_card("nav"), name, "smoke", sets).configuration.method
     return load(method(name).learner)(settings, task, Streams(0), "cpu", lambda *_: None)
 
 
-def test_states_are_standardised_by_the_first_rollout():
+def shown_to_the_layers(learner, observations):
+    shown = []
+    body = learner.network.pi_features_extractor.body
+    body.register_forward_pre_hook(lambda _, given: shown.append(given[0]))
+    learner.network.get_distribution(torch.from_numpy(observations))
+    return shown[0].detach().numpy()
+
+
+def test_every_entry_of_a_state_is_standardised_but_for_a_constant_one():
     learner = learner_of_states()
-    states = np.random.default_rng(0).normal(5.0, 3.0, (200, 4)).astype(np.float32)
+    states = np.random.default_rng(0).normal(5.0, [3, 1, 7, 0.1], (200, 4)).astype(np.float32)
     states[:, 1] = 7.0
     learner.network.standardise_by(states)
-    extractor = learner.network.pi_features_extractor
-    shown = []
-    extractor.body.register_forward_pre_hook(lambda _, given: shown.append(given[0]))
-    learner.network.get_distribution(torch.from_numpy(states))
-    found = shown[0].detach().numpy()
-    np.testing.assert_allclose(found.mean(axis=0), 0.0, atol=1e-5)
-    np.testing.assert_allclose(found.std(axis=0), [1, 0, 1, 1], atol=1e-5)
+    found = shown_to_the_layers(learner, states)
+    np.testing.assert_allclose(found.mean(axis=0), 0.0, atol=1e-4)
+    np.testing.assert_allclose(found.std(axis=0), [1, 0, 1, 1], atol=1e-4)
+
+
+def test_images_are_standardised_by_their_mean_and_one_scale():
+    learner = learner_of("ppo", load_card("nav").task, 'network.input="standardised"')
+    images = np.random.default_rng(0).integers(0, 256, (150, 2, 32, 32), dtype=np.uint8)
+    images[:, 1] //= 8
+    learner.network.standardise_by(images)
+    found = shown_to_the_layers(learner, images)
+    np.testing.assert_allclose(found.mean(axis=0), 0.0, atol=1e-4)
+    assert found.std() == pytest.approx(1.0, abs=1e-4)
+    ratio = found[:, 0].std() / found[:, 1].std()
+    assert ratio == pytest.approx(images[:, 0].std() / images[:, 1].std(), rel=0.02)
+
+
+@both
+def test_the_first_rollout_alone_standardises(tmp_path, name):
+    run = OnPolicyRun(tmp_path, name, 'network.input="standardised"')
+    extractor = run.learner.network.vf_features_extractor
+    assert float(extractor.scale) == 1.0
+    run.iterate(1, 1)
+    first = digest([extractor.mean, extractor.scale])
+    assert float(extractor.scale) < 1.0
+    assert float(extractor.mean.max()) > 0.0
+    run.iterate(2, 2)
+    assert digest([extractor.mean, extractor.scale]) == first
 
 
 # Evaluations
@@ -288,7 +319,7 @@ def test_evaluations_are_evenly_spaced_on_a_logarithmic_axis():
     steps = np.diff(np.log10([p for p in points if p >= 10]))
     assert steps.min() > 0.5 / 20
     assert steps.max() < 1.5 / 20 + 1e-9
-    assert {20, 40, 100, 200, 400, 800, 1000, 2000, 4000} <= set(points)
+    assert {20, 40, 100, 200, 400, 500, 1000, 2000, 4000} <= set(points)
     assert [evaluated_after(k, 2) for k in range(6)] == [0, 1, 3, 10, 32, 100]
 
 
