@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch.distributions import Normal
 
 from solar_cli.models.actor_critic import ActorCriticOfLayers
 from solar_cli.settings import TaskSettings
@@ -31,7 +32,8 @@ class Actor:
 
     def __init__(self, network: ActorCriticOfLayers, task: TaskSettings) -> None:
         self.network, self.task = network, task
-        self._steps: list[list[tuple[NDArray[Any], ...]]] = []  # of each group of episodes
+        self._steps: list[list[tuple[Floats32, Floats32, Floats32]]] = []
+        # of each group of episodes: what was drawn, its means, values
 
     def start(self, episodes: int, stream: np.random.Generator | None) -> Floats32 | None:
         """(N, T, a) noise of whole episodes, in units of its std."""
@@ -52,22 +54,22 @@ class Actor:
         if state is None:
             means = network.get_distribution(seen).mode().double().cpu().numpy() * bound
             return means, means, state
-        network.action_dist.noise = torch.from_numpy(state[:, t]).to(network.device)
-        drawn, values, log_probs = (part.cpu() for part in network(seen))
-        means = network.action_dist.mode().double().cpu().numpy() * bound
-        self._steps[-1].append((drawn.numpy(), values[:, 0].numpy(), log_probs.numpy()))
-        return drawn.double().numpy() * bound, means, state
+        mean, value = (part.cpu().numpy() for part in network.mean_and_value(seen))
+        drawn = mean + network.log_std.exp().cpu().numpy() * state[:, t]
+        self._steps[-1].append((drawn, mean, value[:, 0]))
+        return drawn.astype(np.float64) * bound, mean.astype(np.float64) * bound, state
 
+    @torch.no_grad()
     def taken(self) -> Taken:
         """What was noted, of all episodes in their order."""
-        return Taken(
-            *(
-                np.concatenate(
-                    [np.stack([step[part] for step in group], axis=1) for group in self._steps]
-                )
-                for part in range(len(Taken._fields))
-            )
+        drawn, means, values = (
+            np.concatenate([np.stack(part, axis=1) for part in parts])
+            for parts in zip(*(zip(*group, strict=True) for group in self._steps), strict=True)
         )
+        stds = self.network.log_std.exp().cpu()
+        known = Normal(torch.from_numpy(means), stds, validate_args=False)
+        log_probs: Floats32 = known.log_prob(torch.from_numpy(drawn)).sum(dim=-1).numpy()  # type: ignore[no-untyped-call]
+        return Taken(drawn, values, log_probs)
 
     @torch.no_grad()
     def values(self, observations: NDArray[Any]) -> Floats32:

@@ -48,7 +48,7 @@ class BatchedVecEnv(VecEnv):
         infos = _rows(info, self.num_envs)
         for row in range(self.num_envs):
             infos[row]["TimeLimit.truncated"] = bool(truncated[row])
-        for row in np.flatnonzero(truncated):
+        for row in np.flatnonzero(truncated).tolist():
             assert finals is not None
             infos[row] |= {name: float(final[name][row]) for name in final if name[0] != "_"}
             infos[row]["terminal_observation"] = finals[row]

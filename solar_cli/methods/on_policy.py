@@ -149,7 +149,8 @@ class OnPolicyLearner(Learner, ABC):
             raise Diverged(f"the policy after update {self.rollouts + 1} is not finite")
         logged = model.logger.name_to_value
         said = {LOGGED.get(name.removeprefix("train/")): value for name, value in logged.items()}
-        said["policy_std"] = float(self.network.log_std.detach().exp().mean()) * self.task.action.bound
+        stds = self.network.log_std.detach().exp() * self.task.action.bound
+        said["policy_std"] = float(stds.mean())
         for metric, value in said.items():
             if metric is not None:
                 self.sums[metric] = self.sums.get(metric, 0.0) + float(value)
@@ -220,6 +221,8 @@ class OnPolicyLearner(Learner, ABC):
 
 def windows(episodes: Episodes) -> NDArray[Any]:
     """(N, T, W C, H, W) or (N, T, W S): what every step was chosen by."""
+    if episodes.window == 1:  # a view: no copy of what fills the memory
+        return episodes.frames[:, :-1]
     index = window_indices(episodes.horizon, episodes.window)[:-1]
     seen = episodes.frames[:, index]
     return stacked(seen.reshape(-1, *seen.shape[2:])).reshape(*seen.shape[:2], -1, *seen.shape[4:])

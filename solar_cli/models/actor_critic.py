@@ -1,4 +1,4 @@
-"""Policies of Stable-Baselines3 on a card's layers, sampled with noise that was drawn before."""
+"""Policies of Stable-Baselines3 on a card's layers."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import torch
 from gymnasium import spaces
 from jaxtyping import Float
 from numpy.typing import NDArray
-from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import Schedule
 from torch import Tensor, nn
 
 from solar_cli.models.networks import build
@@ -20,6 +20,8 @@ from solar_cli.settings.on_policy import ActorCritic
 
 CONSTANT = 1e-6
 """What has a smaller std keeps its scale."""
+ADAM_EPS = 1e-5
+"""Stable-Baselines3's"""
 CHUNK = 64
 """windows in floating point at once: bounds memory"""
 
@@ -63,34 +65,42 @@ class Layers(BaseFeaturesExtractor):
         return features
 
 
-class PredrawnGaussian(DiagGaussianDistribution):
-    """Stable-Baselines3's Gaussian; what it samples is made of ``noise``, not of a global stream."""
-
-    noise: Float[Tensor, "n a"]
-
-    def sample(self) -> Float[Tensor, "n a"]:
-        """Mean + std x noise."""
-        drawn: Tensor = self.distribution.mean + self.distribution.stddev * self.noise
-        return drawn
-
-
 class ActorCriticOfLayers(ActorCriticPolicy):
     """Stable-Baselines3's policy and value, as a card describes them, for actions in [-1, 1]."""
 
-    action_dist: PredrawnGaussian
-
-    def __init__(self, *args: Any, settings: ActorCritic, **kwargs: Any) -> None:
+    def __init__(
+        self,
+        observation_space: spaces.Box,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        settings: ActorCritic,
+        use_sde: bool = False,
+    ) -> None:
         heads = list(settings.heads)
         super().__init__(
-            *args,
+            observation_space,
+            action_space,
+            lr_schedule,
             net_arch={"pi": heads, "vf": heads},
             log_std_init=math.log(settings.std),
             features_extractor_class=Layers,
             features_extractor_kwargs={"settings": settings},
             share_features_extractor=settings.shared,
-            **kwargs,
+            optimizer_kwargs={"eps": ADAM_EPS, "fused": True},
+            use_sde=use_sde,  # which Stable-Baselines3 always passes on
         )
-        self.action_dist = PredrawnGaussian(int(np.prod(self.action_space.shape or ())))
+
+    def mean_and_value(
+        self, observations: Float[Tensor, "n *shape"]
+    ) -> tuple[Float[Tensor, "n a"], Float[Tensor, "n 1"]]:
+        """The mean action, and the expected return."""
+        features = self.extract_features(observations)
+        if self.share_features_extractor:
+            of_policy, of_value = self.mlp_extractor(features)
+        else:
+            of_policy = self.mlp_extractor.forward_actor(features[0])
+            of_value = self.mlp_extractor.forward_critic(features[1])
+        return self.action_net(of_policy), self.value_net(of_value)
 
     def standardise_by(self, windows: NDArray[Any]) -> None:
         """Take mean and scale from observations (n, *shape), where the card says so."""

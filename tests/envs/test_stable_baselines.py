@@ -40,7 +40,8 @@ def same(one, two):
 def test_it_equals_a_loop_over_singles(both):
     ours, loop = both
     horizon = ours.batched._core.settings.horizon
-    assert (ours.observation_space, ours.action_space) == (loop.observation_space, loop.action_space)
+    assert ours.observation_space == loop.observation_space
+    assert ours.action_space == loop.action_space
     for env in both:
         env.seed(5)
     same(ours.reset(), loop.reset())
