@@ -249,7 +249,8 @@ class Environment:
     """The world that a cell learns in: it collects, and what it collects counts.
 
     Collections are keyed by (iteration, call): repeating an iteration after an interruption finds
-    its episodes on disk, or, when a file is damaged, collects the very same ones again.
+    its episodes on disk, or, when a file is damaged, collects the very same ones again. So it does
+    with those that nobody wanted kept.
     """
 
     def __init__(self, task: Task, settings: TaskSettings, streams: Streams, folder: Path) -> None:
@@ -277,8 +278,18 @@ class Environment:
         self.iteration = iteration
         self._call = 0
 
-    def collect(self, policy: Policy, episodes: int, *, noisy: bool = True) -> Episodes:
-        """Line 4 of Algorithm 1: run the policy for ``episodes`` episodes that count."""
+    def resume_at(self, call: int) -> None:
+        """Go on with this call of the iteration: from the earlier ones, all is learned."""
+        self._call = call
+
+    def collect(
+        self, policy: Policy, episodes: int, *, noisy: bool = True, kept: bool = True
+    ) -> Episodes:
+        """Line 4 of Algorithm 1: run the policy for ``episodes`` episodes that count.
+
+        Those that are not ``kept`` are on no disk, and no `batches` name them: a method on policy
+        learns from them once.
+        """
         key = (self.iteration, self._call)
         self._call += 1
         entry = next((e for e in self._ledger if (e["iteration"], e["call"]) == key), None)
@@ -287,7 +298,7 @@ class Environment:
                 f"iteration {key[0]} has {entry['episodes']} episodes where {episodes} others are "
                 "collected now: start the cell anew with --redo"
             )
-        found = None if entry is None else self._load(entry)
+        found = self._load(entry) if kept and entry is not None else None
         if found is None:
             streams = self._streams.under(*key)
             collected = roll_out(
@@ -297,9 +308,13 @@ class Environment:
                 [streams.generator("reset", i) for i in range(episodes)],
                 streams.generator("noise") if noisy else None,
             )
+            if not kept:
+                if entry is None:
+                    self._ledger.append(self._described(key, noisy, collected))
+                return collected.episodes
             found = replace(collected.episodes, batch=Batch(*key, noisy))
             data = _packed(found)
-            made = self._described(key, noisy, collected, data)
+            made = self._described(key, noisy, collected) | _named(key, data)
             # Compared as files: one that another zlib has compressed counts as another, too.
             if entry is not None and made["sha256"] != entry["sha256"]:
                 # The policy is not the one that collected them: a training has gone on since.
@@ -310,12 +325,12 @@ class Environment:
         return self._hold(key, found)
 
     def batches(self) -> list[Batch]:
-        """All that was collected, oldest first."""
-        return [_name(entry) for entry in self._ledger]
+        """All that was collected and kept, oldest first."""
+        return [_name(entry) for entry in self._kept()]
 
     def batch(self, name: Batch) -> Episodes:
         """The episodes of one call."""
-        return self._get(self._ledger[self.batches().index(name)])
+        return self._get(next(entry for entry in self._kept() if _name(entry) == name))
 
     def recent(self, iterations: int) -> list[Episodes]:
         """The batches of the last ``iterations``, in their order."""
@@ -334,7 +349,7 @@ class Environment:
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """The ledger: which files hold which episodes, with their hashes."""
+        """The ledger: what was collected, and which files hold it, with their hashes."""
         return {"ledger": [dict(entry) for entry in self._ledger]}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -344,6 +359,9 @@ class Environment:
             for entry in state["ledger"]
         ]
         self._held.clear()
+
+    def _kept(self) -> list[dict[str, Any]]:
+        return [entry for entry in self._ledger if "file" in entry]
 
     def _get(self, entry: Mapping[str, Any]) -> Episodes:
         key = (int(entry["iteration"]), int(entry["call"]))
@@ -378,9 +396,9 @@ class Environment:
             return Episodes(**dict(arrays), window=window, batch=_name(entry))
 
     def _described(
-        self, key: tuple[int, int], noisy: bool, collected: Evaluation, data: bytes
+        self, key: tuple[int, int], noisy: bool, collected: Evaluation
     ) -> dict[str, Any]:
-        """The ledger's entry of episodes whose file holds ``data``."""
+        """The ledger's entry of episodes, but for their file."""
         episodes = collected.episodes
         clipped = np.abs(episodes.actions[episodes.live_steps]) >= self.settings.action.bound
         return {
@@ -389,8 +407,6 @@ class Environment:
             "noisy": noisy,
             "episodes": len(episodes),
             "steps": int(episodes.lengths.sum()),
-            "file": f"{key[0]:04d}-{key[1]}.npz",
-            "sha256": hashlib.sha256(data).hexdigest(),
             "summary": {
                 **{name: float(values.mean()) for name, values in collected.summary().items()},
                 "clipped": float(clipped.mean()),
@@ -412,6 +428,12 @@ def _name(entry: Mapping[str, Any]) -> Batch:
     return Batch(int(entry["iteration"]), int(entry["call"]), bool(entry["noisy"]))
 
 
+def _named(key: tuple[int, int], data: bytes) -> dict[str, Any]:
+    """The part of the ledger's entry that is of a file."""
+    name = f"{key[0]:04d}-{key[1]}.npz"
+    return {"file": name, "sha256": hashlib.sha256(data).hexdigest()}
+
+
 def _packed(episodes: Episodes) -> bytes:
     """What the file of these episodes holds; equal episodes give equal bytes."""
     arrays = {name: getattr(episodes, name) for name in ARRAYS}
@@ -427,6 +449,7 @@ class Experience:
 
     def __init__(self, environment: Environment) -> None:
         self.collect = environment.collect
+        self.resume_at = environment.resume_at
         self.batches = environment.batches
         self.batch = environment.batch
         self.recent = environment.recent

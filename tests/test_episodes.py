@@ -341,6 +341,43 @@ def test_a_repeated_iteration_finds_what_it_collected(environment: Environment):
     assert_equal_bits(environment.collect(Pull(gain=0.9), 4), collected)
 
 
+def test_episodes_that_are_not_kept_count_and_are_nowhere(environment: Environment):
+    environment.begin(1)
+    kept = environment.collect(Pull(), 2)
+    environment.collect(Pull(), 4, kept=False)
+    assert (environment.episodes, environment.steps) == (6, 6 * T)
+    assert [path.name for path in files(environment)] == ["0001-0.npz"]
+    assert environment.batches() == [Batch(1, 0)]
+    [recent] = environment.recent(1)
+    assert_equal_bits(recent, kept)
+    with pytest.raises(StopIteration):
+        environment.batch(Batch(1, 1))
+
+
+def test_episodes_that_are_not_kept_are_in_the_summary(environment: Environment):
+    parts = []
+    for kept in (True, False):
+        environment.begin(1 + len(parts))
+        collected = [environment.collect(Pull(), count, kept=kept) for count in (2, 4)]
+        parts.append((environment.summary(environment.iteration), collected))
+    for summary, collected in parts:
+        costs = np.concatenate([batch.costs for batch in collected])
+        assert summary["return"] == pytest.approx(-costs.sum(axis=1).mean())
+
+
+def test_episodes_that_are_not_kept_are_collected_again_and_count_once(environment: Environment):
+    environment.begin(1)
+    collected = [environment.collect(Pull(), 4, kept=False) for _ in range(3)]
+    resumed = again(environment, 1)
+    resumed.resume_at(1)
+    for before in (*collected[1:], None):
+        found = resumed.collect(Pull(), 4, kept=False)
+        if before is not None:
+            assert_equal_bits(found, before)
+            assert resumed.episodes == 12
+    assert resumed.episodes == 16
+
+
 def test_recent_batches_are_those_of_the_last_iterations_oldest_first(environment: Environment):
     batches: dict[int, list[Episodes]] = {}
     for iteration in (1, 2, 3, 4):
@@ -364,7 +401,7 @@ def test_a_learner_meets_its_experience_and_no_judge(environment: Environment):
     assert experience.iteration == 3
     assert_equal_bits(experience.batch(Batch(3, 0)), collected)
     public = {name for name in dir(experience) if not name.startswith("_")}
-    assert public == {"collect", "batches", "batch", "recent", "iteration"}
+    assert public == {"collect", "resume_at", "batches", "batch", "recent", "iteration"}
 
 
 @pytest.mark.parametrize(("count", "noisy"), [(3, False), (2, True)])

@@ -13,13 +13,13 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium import spaces
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from solar_cli.envs import build_task, picture
+from solar_cli.envs.spaces import action_space, observation_space
 from solar_cli.envs.task import Frames
 from solar_cli.settings import TaskSettings, load_card
 from solar_cli.settings.card import card_folders
@@ -55,14 +55,9 @@ class _Core:
     def __init__(self, card: str) -> None:
         self.settings = task_settings(card)
         self.task = build_task(self.settings)
-        seen, bound = self.settings.observation, self.settings.action.bound
-        shape = (seen.window * seen.frame_shape[0], *seen.frame_shape[1:])
-        self.observation_space = (
-            spaces.Box(0, 255, shape, np.uint8)
-            if seen.kind == "image"
-            else spaces.Box(-np.inf, np.inf, shape, np.float32)
-        )
-        self.action_space = spaces.Box(-bound, bound, (self.task.action_size,), np.float32)
+        seen = self.settings.observation
+        self.observation_space = observation_space(self.settings)
+        self.action_space = action_space(self.settings)
         self._windows: Array = np.empty((0, seen.window, *seen.frame_shape))
 
     def reset(self, streams: Sequence[np.random.Generator]) -> None:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from solar_cli.experiment.matrix import Action, Plan
 from solar_cli.settings import Cell
 from solar_cli.settings.local import LatentMethod, LocalControl, StateMethod
+from solar_cli.settings.on_policy import OnPolicy
 from solar_cli.store.records import CellRecord, State
 
 if TYPE_CHECKING:
@@ -52,7 +53,8 @@ def memory_needs(cell: Cell) -> list[Need]:
 
     Episodes of the last evaluation and of the first batch; of a local method a minibatch's frames,
     for each time step a matrix over states and moments of what a quadratic of latents is made of,
-    and the weights of all pairs of time steps that posterior inference uses.
+    and the weights of all pairs of time steps that posterior inference uses; of a method on policy
+    the windows of a rollout.
     """
     task, method = cell.configuration.task, cell.configuration.method
     judged = cell.configuration.evaluation.episodes
@@ -72,8 +74,8 @@ def memory_needs(cell: Cell) -> list[Need]:
         longest = (f"{prefix}.training.segments", f"{prefix}.training.length", "task.observation")
         needs.append(Need(drawn, "a minibatch of segments", longest))
     if isinstance(method, LocalControl):
-        named = "representation.latent" if isinstance(method, LatentMethod) else "components"
-        long, latents = (f"{prefix}.{named}", "task.horizon"), method.latents(seen)
+        size = "representation.latent" if isinstance(method, LatentMethod) else "components"
+        long, latents = (f"{prefix}.{size}", "task.horizon"), method.latents(seen)
         matrices = task.horizon * (latents * seen.window) ** 2 * FLOAT_BYTES
         needs.append(Need(matrices, "dynamics of latent states", long))
         monomials = (latents + 1) * (latents + 2) // 2  # of a quadratic
@@ -82,6 +84,10 @@ def memory_needs(cell: Cell) -> list[Need]:
         if method.local_fit.method == "posterior":
             pairs = task.horizon**2 * FLOAT_BYTES
             needs.append(Need(pairs, "weights of neighbouring time steps", ("task.horizon",)))
+    if isinstance(method, OnPolicy):
+        every = method.rollout * (episode + task.horizon * seen.window * frame)
+        named = (f"{prefix}.rollout", *sizes)
+        needs.append(Need(every, "a rollout with all its windows", named))
     return needs
 
 

@@ -146,11 +146,13 @@ class Session:
         self._unsaved = True
         return {name: float(value) for name, value in metrics.items()}
 
-    def _collect(self, policy: Policy, episodes: int, *, noisy: bool = True) -> Episodes:
+    def _collect(
+        self, policy: Policy, episodes: int, *, noisy: bool = True, kept: bool = True
+    ) -> Episodes:
         """As `Environment.collect`, watched and timed."""
         self._simulator.expect(episodes)
         with self._watch.running("collecting"):
-            return self.environment.collect(policy, episodes, noisy=noisy)
+            return self.environment.collect(policy, episodes, noisy=noisy, kept=kept)
 
     def _conclude(self, train: dict[str, float]) -> None:
         """Evaluate; then checkpoint file, metrics and progress become durable, in this order."""

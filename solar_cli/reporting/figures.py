@@ -36,7 +36,7 @@ LONG_LABEL, LONGEST_LINE = 30, 64
 """Characters from which on a label needs both columns, and that there is room for in them."""
 LOG_SPAN = 20.0
 """A measure whose best mean is this many times below its worst gets a logarithmic axis."""
-LOG_EPISODES = 20.0
+LOG_EPISODES = 10.0
 """Curves whose ends differ by more than this factor get a logarithmic axis of episodes."""
 
 

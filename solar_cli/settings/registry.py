@@ -40,6 +40,14 @@ class MethodEntry:
     """where it departs from its source, and why"""
 
 
+ON_POLICY = (
+    "Ours: rollouts of whole episodes, collected side by side; the learning rate falls over the "
+    "card's horizon, to a twentieth; actions in units of their bound; observations standardised by "
+    "the first rollout; costs after an early end are part of the last live step's reward. A "
+    "horizon cuts off, it does not end: the last value counts. The paper gives no settings."
+)
+"""deviations that PPO and TRPO share"""
+
 BUILT_IN = (
     MethodEntry(
         name="solar",
@@ -121,6 +129,26 @@ BUILT_IN = (
         "and blur it; a learned background fills what they leave, and there is no recurrent state: "
         "what is predicted goes back into the window. The planner minimises a learned cost of "
         "predicted frames and the known cost of actions, not the distance of marked pixels.",
+    ),
+    MethodEntry(
+        name="ppo",
+        summary="Model-free: a policy network improved on its own episodes, by clipped likelihood "
+        "ratios (Stable-Baselines3).",
+        source="Schulman et al. 2017 (section 6)",
+        settings="solar_cli.settings.on_policy:Ppo",
+        learner="solar_cli.methods.ppo:Ppo",
+        deviations=f"Networks, buffer, advantages and update are Stable-Baselines3's. {ON_POLICY} "
+        "An update stops at a KL of 1.5 x stop_kl.",
+    ),
+    MethodEntry(
+        name="trpo",
+        summary="Model-free: a policy network improved on its own episodes, by natural gradients "
+        "within a KL bound (sb3-contrib).",
+        source="Schulman et al. 2015 (section 6)",
+        settings="solar_cli.settings.on_policy:Trpo",
+        learner="solar_cli.methods.trpo:Trpo",
+        deviations=f"Networks, buffer, advantages and update are sb3-contrib's. {ON_POLICY} "
+        "The policy's step is computed on a part of the data.",
     ),
     MethodEntry(
         name="zero",

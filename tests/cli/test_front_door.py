@@ -15,6 +15,7 @@ from solar_cli.errors import SolarError
 
 README = Path(__file__).parent.parent.parent / "README.md"
 HEAVY = ("torch", "scipy", "matplotlib", "pandas", "gymnasium", "mujoco")
+HEAVY += ("stable_baselines3", "sb3_contrib")
 LESS = ("sqlalchemy", "numpy", "rich")  # what a database takes, a task, a table
 SMOKE = ("--task", "nav", "--method", "solar", "--variant", "smoke")
 COMMANDS = sorted(command.name for command in cli.app.registered_commands if command.name)

@@ -21,7 +21,9 @@ SMALL: dict[str, tuple[str, ...]] = {
     "global-mpc": ("training.steps=12", "network.steps=12", "planner.horizon=3"),
     "mpc-nn": ("network.steps=12",),
     "pixel-mpc": (),
+    "ppo": (),
     "random": (),
+    "trpo": (),
     "zero": (),
 }
 """the same for others"""

@@ -21,8 +21,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def matrix(tmp_path: Path) -> Iterator[Callable[..., Matrix]]:
     made: list[Matrix] = []
 
-    def make(seeds: int, task: str = "nav") -> Matrix:
-        made.append(Matrix(tmp_path / str(len(made)), seeds, task))
+    def make(seeds: int, task: str = "nav", method: str = "solar") -> Matrix:
+        made.append(Matrix(tmp_path / str(len(made)), seeds, task, method))
         made[-1].folder.mkdir()
         return made[-1]
 

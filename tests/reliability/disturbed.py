@@ -28,6 +28,7 @@ class Matrix:
     folder: Path
     seeds: int = 1
     task: str = "nav"
+    method: str = "solar"
     kills: int = 0
     schedulers: list[subprocess.Popen[bytes]] = field(default_factory=list)
 
@@ -50,7 +51,8 @@ class Matrix:
         settings += [str(self.results), *sets]
         scheduler = subprocess.Popen(
             [sys.executable, str(HERE / "drive.py"), *settings],
-            env=os.environ | {"DIE": die, "KILLS": str(self.folder / "kills.txt")},
+            env=os.environ
+            | {"DIE": die, "METHOD": self.method, "KILLS": str(self.folder / "kills.txt")},
         )
         self.schedulers.append(scheduler)
         return scheduler

@@ -15,12 +15,20 @@ from solar_cli.settings import cells, load_card
 from solar_cli.store.store import Store
 
 # The encoder moves in every iteration, so that each has pulses and an update that depends on it.
+method = os.environ["METHOD"]
 SETS = ["methods.solar.training.steps=60", "methods.solar.training.fine_tune_steps=40"]
 
 database, task, seeds, checkpoint_seconds, out, *sets = sys.argv[1:]
 worker = Path(__file__).parent / "mortal_worker.py"
 engine = LocalEngine([sys.executable, str(worker)]) if os.environ["DIE"] else LocalEngine()
-wanted = cells(load_card(task), "solar", range(int(seeds)), "smoke", [*SETS, *sets], "kills")
+wanted = cells(
+    load_card(task),
+    method,
+    range(int(seeds)),
+    "smoke",
+    [*(SETS if method == "solar" else []), *sets],
+    "kills" if method == "solar" or sets else None,
+)
 with Store.open(database) as store:
     results = run(
         plan(store, wanted, "desk"),  # three iterations

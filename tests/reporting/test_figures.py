@@ -1,5 +1,6 @@
 """Figures: what they must show, and that they can be compared byte by byte."""
 
+import numpy as np
 import pytest
 from hand_made import cell, curve, flat_curve, problem, record, seed
 
@@ -71,6 +72,21 @@ def test_episodes_of_very_different_methods_share_a_logarithmic_axis():
     near, far = flat_curve("solar", [0.5], 100), flat_curve("ppo", [0.5], 100_000)
     assert axes_of(near, far).get_xscale() == "symlog"
     assert axes_of(near).get_xscale() == "linear"
+
+
+def test_a_logarithmic_axis_of_episodes_shows_where_a_curve_starts_and_ends():
+    """Linear up to a quarter of the shortest curve, so that iteration 0 has its place."""
+    starts = [(0, 1.0), (50, 0.9), (240, 0.5)]
+    late = [(0, 1.0), (50, 0.9), (240, 0.8), (20_000, 0.5)]
+    axes = axes_of(curve(seed(0, starts)), curve(seed(0, late), label="ppo"))
+    assert axes.get_xscale() == "symlog"
+    low, high = axes.get_xlim()
+    assert low == 0
+    assert high >= 20_000
+    place = axes.transAxes.inverted().transform
+    shown = [place(axes.transData.transform((count, 0.5)))[0] for count in (0, 50, 240, 20_000)]
+    assert shown[0] == 0
+    assert (np.diff(shown) > 0.05).all()
 
 
 def test_levels_inside_the_figure_are_drawn_and_others_do_not_stretch_it():
