@@ -6,7 +6,7 @@ which the first d are its newest block, a entries of an action.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -18,7 +18,10 @@ from solar_cli.episodes import Episodes
 from solar_cli.models.basis import LatentBasis
 from solar_cli.settings.neural import NeuralFit
 
-ACTIVATIONS = {"relu": partial(nn.ReLU, inplace=True), "silu": nn.SiLU}
+ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {
+    "relu": partial(nn.ReLU, inplace=True),
+    "silu": nn.SiLU,
+}
 LEAST_STD = 1e-6
 """what varies less is constant, and keeps its scale"""
 
