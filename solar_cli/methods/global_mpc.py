@@ -4,8 +4,11 @@ The representation is SOLAR's own, trained as SOLAR trains it. Then one network 
 and all time steps says what an action changes, another one what a state costs, and the
 cross-entropy method plans with both at every step.
 
-What the dynamics predict, the change of the newest latents, is what they are rolled out with; the
-authors' release trained another thing than it used. A plan goes on from that of the step before.
+What the dynamics predict, the change of the newest latents, is what they are rolled out with, and
+they are trained over several steps of that; the authors' release trained another thing than it
+used. A plan goes on from that of the step before, so that fewer samples and iterations than the
+release's do. Nothing but a card's variant tells it that a car should drive forward (section 6.2).
+The first evaluation with a model is the one after the initial episodes.
 """
 
 from __future__ import annotations

@@ -2,6 +2,9 @@
 
 The network predicts changes of the state, both normalised by the first episodes. At every step the
 best of random action sequences under it is found, and its first action taken.
+
+Episodes here are shorter than theirs, so a fit is told its gradient steps instead of passes over
+the data; held-out episodes choose which parameters are kept.
 """
 
 from __future__ import annotations
