@@ -14,8 +14,8 @@ No code of the authors is published. Ours differs from their paper:
   whose older blocks are copies of others, could not be inverted.
 * The network reads and moves latents in units of their std, so that its learning rate can be the
   encoder's, and q(zbar | x, z') begins as p(z | x).
-* The likelihood, the KL term's schedule and a small further KL to N(0, I), without which nothing
-  sets the latents' scale, are SOLAR's: the ablation differs in its model only.
+* The likelihood and the schedule of the KL terms' weight are SOLAR's: only the model differs. On
+  nav a weight of 1 from the start, and a small further KL to N(0, I), changed nothing.
 * They train once. Where a card freezes the encoder after the first training, the two networks of
   transitions go on being fitted to the last B iterations' latents, as SOLAR's factor does.
 """

@@ -143,6 +143,8 @@ class ControllableEmbedding:
     def conclude(self, episodes: Segments) -> None:
         """Fit both networks further to all ``episodes``, with latents as they are."""
         settings, given = self.settings, self._transitions(episodes)
+        if not self.transition.seen:  # true states were given, and nothing was trained
+            self.learn(episodes, 1.0)
         optimiser = torch.optim.Adam(self.parameters(), lr=settings.rate)
         for step in range(settings.steps):
             for group in optimiser.param_groups:

@@ -260,6 +260,7 @@ class Rce(LocalMethod):
     """RCE: a network of locally linear transitions is the prior and, linearised, the dynamics."""
 
     transition: Transition = setting(Transition(), "the model's own dynamics")
+    training: Training = setting(Training(standard_normal=0.0), "line 5 of Algorithm 1")
     local_fit: NetworkFit = setting(NetworkFit(), "line 7 of Algorithm 1")
 
 

@@ -86,10 +86,10 @@ BUILT_IN = (
         learner="solar_cli.methods.rce:Rce",
         deviations="Frames are encoded one by one: where there is a window, A maps the newest "
         "latents, and differences back through the window enter linearly, as the action does. The "
-        "network works in units of the latents' std. Likelihood, schedules and a small further KL "
-        "to N(0, I) are SOLAR's here, so that only the model differs. Where the encoder is frozen, "
-        "the transition network is fitted further in every iteration. Control is SOLAR's LQR on "
-        "its slopes, with offsets and noise from its errors, and not iLQR on its rollouts.",
+        "network works in units of the latents' std. Likelihood and schedules are SOLAR's here, so "
+        "that only the model differs. Where the encoder is frozen, the transition network is "
+        "fitted further in every iteration. Control is SOLAR's LQR on its slopes, with offsets and "
+        "noise from its errors, and not iLQR on its rollouts.",
     ),
     MethodEntry(
         name="global-mpc",

@@ -265,6 +265,19 @@ def test_units_follow_the_latents(window):
 
 
 @windows
+def test_fitting_further_takes_units_only_where_there_are_none(window):
+    segments = made_up_segments(3, [0] * 4, T + 1, d, a)
+    taught, fresh = embedding(window, wild=False), embedding(window, wild=False)
+    taught.learn(segments, 1.0)
+    units = [part.clone() for part in taught.transition.buffers()]
+    for prior in (taught, fresh):
+        prior.conclude(segments)
+        assert all(map(torch.equal, prior.transition.buffers(), units))
+    taught.conclude(segments._replace(mean=2 * segments.mean))
+    assert all(map(torch.equal, taught.transition.buffers(), units))
+
+
+@windows
 def test_a_network_that_is_right_has_an_r2_of_one(window):
     prior, segments = embedding(window), made_up_segments(4, [0] * 5, T + 1, d, a)
     mean = segments.mean.clone()
