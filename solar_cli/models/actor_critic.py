@@ -11,6 +11,7 @@ from gymnasium import spaces
 from jaxtyping import Float
 from numpy.typing import NDArray
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import Schedule
 from torch import Tensor, nn
@@ -89,6 +90,13 @@ class ActorCriticOfLayers(ActorCriticPolicy):
             optimizer_kwargs={"eps": ADAM_EPS, "fused": True},
             use_sde=use_sde,  # which Stable-Baselines3 always passes on
         )
+
+    def extract_features(self, obs: Any, features_extractor: Any = None) -> Any:
+        """As Stable-Baselines3's; where there are two, an observation is converted once."""
+        if self.share_features_extractor or features_extractor is not None:
+            return super().extract_features(obs, features_extractor)
+        seen = preprocess_obs(obs, self.observation_space, self.normalize_images)
+        return self.pi_features_extractor(seen), self.vf_features_extractor(seen)
 
     def mean_and_value(
         self, observations: Float[Tensor, "n *shape"]
