@@ -138,11 +138,6 @@ BUILT_IN = (
         settings="solar_cli.settings.on_policy:Ppo",
         learner="solar_cli.methods.ppo:Ppo",
         deviations=f"Networks, buffer, advantages and update are Stable-Baselines3's. {ON_POLICY} "
-        deviations="Networks, buffer, advantages and update are Stable-Baselines3's. Ours: whole "
-        "episodes, collected side by side; the learning rate falls over the card's horizon, to a "
-        "twentieth; actions in units of their bound; observations standardised by the first "
-        "rollout; costs after an early end are part of the last live step's reward. A horizon cuts "
-        "off, it does not end: the last value counts. The paper gives no settings. "
         "An update stops at a KL of 1.5 x stop_kl.",
     ),
     MethodEntry(
@@ -153,11 +148,6 @@ BUILT_IN = (
         settings="solar_cli.settings.on_policy:Trpo",
         learner="solar_cli.methods.trpo:Trpo",
         deviations=f"Networks, buffer, advantages and update are sb3-contrib's. {ON_POLICY} "
-        deviations="Networks, buffer, advantages and update are sb3-contrib's. Ours: whole "
-        "episodes, collected side by side; the learning rate falls over the card's horizon, to a "
-        "twentieth; actions in units of their bound; observations standardised by the first "
-        "rollout; costs after an early end are part of the last live step's reward. A horizon cuts "
-        "off, it does not end: the last value counts. The paper gives no settings. "
         "The policy's step is computed on a part of the data.",
     ),
     MethodEntry(
