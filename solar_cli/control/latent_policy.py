@@ -26,8 +26,13 @@ class Embedding(Protocol):
     def basis(self) -> LatentBasis:
         """From windows of latents to states."""
 
-    def encode(self, frames: NDArray[Any]) -> Float[Tensor, "n d"]:
-        """Latents of single frames."""
+    def follow(
+        self, frames: NDArray[Any], t: int, belief: Any, actions: Float[Tensor, "N a"] | None
+    ) -> tuple[Float[Tensor, "N d"], Any]:
+        """Latents of the newest frames, and the belief for the next step.
+
+        ``belief`` and ``actions`` are the step before's, None at the start.
+        """
 
 
 class Acting(NamedTuple):
@@ -37,6 +42,10 @@ class Acting(NamedTuple):
     """unit-variance noise, or None for a noise-free policy"""
     latents: tuple[Tensor, ...]
     """(N, d) latents of the window's frames, newest first"""
+    belief: Any = None
+    """what the embedding carries"""
+    actions: Float[Tensor, "N a"] | None = None
+    """of the step before"""
 
 
 class LatentPolicy:
@@ -64,9 +73,9 @@ class LatentPolicy:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], Acting]:
         """Actions, their means and the state; only the newest frame is encoded."""
         mean = self.gains.k[t].expand(len(observations), -1)
-        latents = state.latents
+        latents, belief = state.latents, state.belief
         if self.embedding.trained:
-            newest = self.embedding.encode(observations[:, -1])
+            newest, belief = self.embedding.follow(observations[:, -1], t, belief, state.actions)
             # Before the start of an episode its first frame repeats.
             latents = (newest, *(latents or (newest,) * self.window))[: self.window]
             z = self.embedding.basis.state(torch.stack(latents, dim=1)).cpu()
@@ -74,4 +83,5 @@ class LatentPolicy:
         action = mean
         if state.noise is not None:
             action = mean + state.noise[:, t] @ self._spread[t].T
-        return action.numpy(), mean.numpy().copy(), Acting(state.noise, latents)
+        acted = Acting(state.noise, latents, belief, action)
+        return action.numpy().copy(), mean.numpy().copy(), acted

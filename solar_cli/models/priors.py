@@ -20,8 +20,9 @@ from solar_cli.settings.local import Dynamics
 
 
 class Segments(NamedTuple):
-    """Posterior factors q(z | s) of segments of consecutive frames, float64.
+    """Gaussians of the latents of segments of consecutive frames, float64 but in a minibatch.
 
+    What the encoder says of each frame; or a posterior q(z), whose frames may depend on each other.
     All segments have L frames of an episode's T + 1. Where they are shorter than an episode, their
     starts are taken as drawn uniformly: what such segments reach less often counts for more.
     """
@@ -35,6 +36,16 @@ class Segments(NamedTuple):
     """the frames that count, the first ones of each segment; None where all do"""
     starts: Int[Tensor, " S"] | None = None
     """starts that a segment of each one's episode can have; None for a whole episode's T + 2 - L"""
+    covariance: Float[Tensor, "S L d d"] | None = None
+    """of a posterior whose frames depend on each other; ``variance`` is its diagonal"""
+    cross: Float[Tensor, "S L_1 d d"] | None = None
+    """Cov(z_t, z_{t+1}), as ``covariance``"""
+    kl: Float[Tensor, " S"] | None = None
+    """KL(q(z) || prior) of each segment, as ``covariance``"""
+
+    def decoded_from(self, latents: Float[Tensor, "n d"]) -> Float[Tensor, "n d"] | None:
+        """``latents`` of this posterior for a decoder; None where they are the encoder's own."""
+        return None if self.covariance is None else latents.float()
 
     def counted(self, part: Float[Tensor, "S n *rest"]) -> Float[Tensor, "k *rest"]:
         """Of one value a frame, or a transition to one of the last n frames: those that count."""
@@ -73,6 +84,34 @@ class LatentPrior(NamedTuple):
 class Prior(Protocol):
     """What the representation is asked to look like."""
 
+    def inferred(self, encoded: Segments) -> Segments:
+        """The posterior q(z), given what the encoder says of each frame."""
+
+    def sampled(
+        self, encoded: Segments, noise: Float[Tensor, "S L d"]
+    ) -> tuple[Float[Tensor, "S L d"], Segments]:
+        """float32 latents of every frame drawn from the posterior, and the posterior."""
+
+    def settle(self) -> None:
+        """End a training: what ``read`` and ``follow`` do is as of now, and changes no more."""
+
+    def read(self, encoded: Segments) -> Float[Tensor, "S L d"]:
+        """Latents of whole episodes as control sees them: of each frame and those before it."""
+
+    def follow(
+        self,
+        mean: Float[Tensor, "N d"],
+        variance: Float[Tensor, "N d"],
+        belief: Any,
+        actions: Float[Tensor, "N a"] | None,
+        t: int,
+    ) -> tuple[Float[Tensor, "N d"], Any]:
+        """One step of ``read`` while episodes run: latents of the newest frame, and the belief.
+
+        ``mean`` and ``variance`` are the encoder's; ``belief`` is what the step before returned and
+        ``actions`` were executed since, both None at t = 0.
+        """
+
     @property
     def factor(self) -> mniw.RegressionStatistics | None:
         """q(F, Sigma) over [windows of latents; a; 1], or None for a prior without dynamics."""
@@ -102,7 +141,41 @@ class Prior(Protocol):
         """Take them up."""
 
 
-class StandardNormal:
+class MeanField:
+    """q(z) is what the encoder says, frame by frame (Eq. 5)."""
+
+    def inferred(self, encoded: Segments) -> Segments:
+        """As encoded."""
+        return encoded
+
+    def sampled(
+        self, encoded: Segments, noise: Float[Tensor, "S L d"]
+    ) -> tuple[Float[Tensor, "S L d"], Segments]:
+        """Each frame on its own, in the precision of the networks."""
+        sample = encoded.mean + encoded.variance.sqrt() * noise
+        doubles = encoded._replace(mean=encoded.mean.double(), variance=encoded.variance.double())
+        return sample, doubles
+
+    def settle(self) -> None:
+        """The encoder's mean is all there is to read."""
+
+    def read(self, encoded: Segments) -> Float[Tensor, "S L d"]:
+        """The encoder's mean."""
+        return encoded.mean
+
+    def follow(
+        self,
+        mean: Float[Tensor, "N d"],
+        variance: Float[Tensor, "N d"],
+        belief: Any,
+        actions: Float[Tensor, "N a"] | None,
+        t: int,
+    ) -> tuple[Float[Tensor, "N d"], Any]:
+        """The encoder's mean; nothing is carried."""
+        return mean, None
+
+
+class StandardNormal(MeanField):
     """p(z_t) = N(0, I): the VAE ablation."""
 
     factor = None
@@ -162,7 +235,7 @@ class DynamicsStatistics(NamedTuple):
     """frames that these terms judge: S times those of an episode"""
 
 
-class BayesianLDS:
+class BayesianLDS(MeanField):
     """MNIW factors over (F, Sigma) and the NIW factor over (mu, Sigma_0), Eq. 2 to 5.
 
     With ``factors = "shared"`` one factor explains every time step, else each has its own. Only

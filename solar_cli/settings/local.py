@@ -63,6 +63,13 @@ class Representation(Settings):
 class Dynamics(Settings):
     """The Bayesian linear dynamical system over latents (Eq. 2-5)."""
 
+    posterior: Literal["mean-field", "smoother"] = setting(
+        "mean-field",
+        "q(z): a factor a frame (Eq. 5), or what a smoother infers from single frames by the "
+        "dynamics; control then sees the means of its filter",
+        "Eq. 5; the authors' release smooths",
+        added="mean-field",
+    )
     factors: Literal["shared", "varying"] = setting(
         "shared", "one q(F, Sigma) for all time steps, or one a time step as in Eq. 5"
     )

@@ -24,10 +24,12 @@ class Embedding:
             torch.as_tensor(rng.normal(size=(size, size))), torch.as_tensor(rng.normal(size=size))
         )
         self.encoded: list[np.ndarray] = []
+        self.carried: list[tuple] = []
 
-    def encode(self, frames):
+    def follow(self, frames, t, belief, actions):
         self.encoded.append(frames.copy())
-        return torch.from_numpy(frames[:, :d].astype(np.float64))
+        self.carried.append((t, belief, actions))
+        return torch.from_numpy(frames[:, :d].astype(np.float64)), t
 
 
 def gains(window=W, seed=1) -> LinearGaussianPolicy:

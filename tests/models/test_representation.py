@@ -181,13 +181,13 @@ def test_an_active_latent_is_one_whose_mean_carries_its_variance(monkeypatch):
     model = make()
     model.update(Collected(FIRST))
     monkeypatch.setattr(representation, "ACTIVE_SHARE", 0.9)
-    segments = model._model.posterior(FIRST, "cpu")
+    segments = model._model.encoded(FIRST, "cpu")
     # One latent varies as its variance is, so its mean carries half; the other hardly has any.
     spread = segments.mean.flatten(0, 1).var(dim=0)
     variance = torch.stack([spread[0], 0.01 * spread[1]])
     monkeypatch.setattr(
         model._model,
-        "posterior",
+        "encoded",
         lambda *_: segments._replace(variance=variance.expand_as(segments.variance)),
     )
     assert model._judge([FIRST])["active_latents"] == 1.0
@@ -296,7 +296,7 @@ def test_a_checkpoint_can_be_made_again_before_anything_goes_on(fine_tune_steps)
 def conditioned(model: Representation, *batches: Episodes) -> list[torch.Tensor]:
     """The factor of a fresh prior after the closed form on these batches."""
     closed = BayesianLDS(model.settings.dynamics, 2, TASK, "cpu")
-    closed.conclude(model._model.posterior(Episodes.joined(list(batches)), "cpu"))
+    closed.conclude(model._model.encoded(Episodes.joined(list(batches)), "cpu"))
     return list(closed.factor)
 
 
@@ -323,9 +323,9 @@ def test_the_same_networks_encode_no_collected_frame_twice(monkeypatch, fine_tun
             unknown = replace(known, batch=None)
             assert torch.equal(model.embed(known), model.embed(unknown))
     encoded: list[int] = []
-    posterior = model._model.posterior
+    encoded_by = model._model.encoded
     monkeypatch.setattr(
-        model._model, "posterior", lambda e, device: encoded.append(len(e)) or posterior(e, device)
+        model._model, "encoded", lambda e, device: encoded.append(len(e)) or encoded_by(e, device)
     )
     for known in named:
         model.embed(known)
@@ -452,7 +452,7 @@ def test_states_are_the_basis_of_windows_of_single_frames():
     states = model.embed(FIRST)
     assert states.shape == (14, 8, 4)
     assert states.dtype == torch.float64
-    latents = torch.stack([model.encode(FIRST.frames[:, t]) for t in range(8)], dim=1)
+    latents = torch.stack([model.follow(FIRST.frames[:, t], t, None, None)[0] for t in range(8)], 1)
     for t, frames in enumerate(window_indices(7, 2)):
         newest_first = [latents[:, frame] for frame in reversed(frames)]
         expected = torch.cat(newest_first, dim=1) @ model.basis.A.T + model.basis.b

@@ -1,0 +1,253 @@
+"""SOLAR's structured posterior: a smoother in training, its filter at run time, single frames.
+
+The encoder gives evidence about each z_t, a Gaussian factor; q(z_0..z_T) is the linear-Gaussian
+chain under q(F, Sigma) with that evidence (Johnson et al. 2016; the authors' release of SOLAR). A
+latent that no single frame shows, a velocity, is inferred from those before and after. Control has
+only those before: it sees the mean of the filter, whose dynamics stay as the last training left
+them, so that a state keeps its meaning. If they are right, that mean is a Markov process with the
+same F, driven by innovations: what local dynamics and costs are fitted to is what the policy acts
+on.
+
+Ours: one block Cholesky factorisation in place of an unrolled log-normaliser that is differentiated
+twice; no expectation-maximisation within line 7, which sees filtered means; factors that are
+concluded by coordinate ascent, which has none of the bias of natural-gradient steps on minibatches
+of a q(z) that depends on the factors itself.
+
+Axes as in `priors`, with windows of one frame.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from solar_cli.errors import UsageError
+from solar_cli.inference import lds, mniw, niw
+from solar_cli.inference.mniw import ExpectedStatistics, RegressionStatistics
+from solar_cli.models.priors import BayesianLDS, Segments
+from solar_cli.settings import TaskSettings
+from solar_cli.settings.local import Dynamics
+
+ROUNDS = 5
+"""of coordinate ascent at the end of a training: each smooths, then gives the factors in closed
+form"""
+
+
+class SmoothedStatistics(NamedTuple):
+    """What segments add to the ELBO, and expected statistics weighed as `Segments` says."""
+
+    kl: Float[Tensor, ""]
+    """sum over segments"""
+    transitions: RegressionStatistics
+    starts: RegressionStatistics
+    judged: int
+    """frames"""
+
+
+class SmoothedLDS(BayesianLDS):
+    """The factors of `BayesianLDS`, and a q(z) that is coupled by them.
+
+    A segment that starts in the middle of an episode has N(0, I) as the prior of its first state.
+    """
+
+    def __init__(self, settings: Dynamics, latent: int, task: TaskSettings, device: str) -> None:
+        if task.observation.window != 1:
+            raise UsageError(
+                "dynamics.posterior = 'smoother' sees single frames: set task.observation.window = "
+                f"1, not {task.observation.window}"
+            )
+        super().__init__(settings, latent, task, device)
+        self.latent = latent
+        self.read_by = (self.factor, self.initial)
+        """the factors that control's filter uses"""
+
+    def inferred(self, encoded: Segments) -> Segments:
+        """Marginals of the chain, and what they cost; differentiable in what is encoded."""
+        evidence = lds.Evidence.gaussian(encoded.mean, encoded.variance)
+        chain = lds.prior_chain(
+            self._starts(encoded.start),
+            self._dynamics(encoded),
+            _inputs(encoded.actions),
+            encoded.live,
+        )
+        if encoded.live is not None:
+            evidence = lds.Evidence(*(part * encoded.live[..., None] for part in evidence))
+        found = lds.smooth(chain.given(evidence))
+        variance = found.covariance.diagonal(dim1=-2, dim2=-1)
+        # E_q of the evidence's logarithm: all that q adds to the prior.
+        second_moment = found.mean.square() + variance
+        added = evidence.linear * found.mean - 0.5 * evidence.precision * second_moment
+        return encoded._replace(
+            mean=found.mean,
+            variance=variance,
+            covariance=found.covariance,
+            cross=found.cross,
+            kl=added.sum((-2, -1)) - found.log_normaliser,
+        )
+
+    def sampled(
+        self, encoded: Segments, noise: Float[Tensor, "S L d"]
+    ) -> tuple[Float[Tensor, "S L d"], Segments]:
+        """Of each frame's marginal."""
+        doubles = encoded._replace(mean=encoded.mean.double(), variance=encoded.variance.double())
+        posterior = self.inferred(doubles)
+        assert posterior.covariance is not None
+        spread = torch.linalg.cholesky(posterior.covariance) @ noise.double().unsqueeze(-1)
+        return (posterior.mean + spread.squeeze(-1)).float(), posterior
+
+    def _starts(self, start: Int[Tensor, " S"]) -> ExpectedStatistics:
+        """The Gaussian of each segment's first state."""
+        initial = mniw.expected_statistics(self.initial)
+        eye = torch.eye(self.latent).to(initial.precision)
+        zero = torch.zeros_like
+        anywhere = ExpectedStatistics(eye, *(zero(part) for part in initial[1:]))
+        begins = start == 0
+        return ExpectedStatistics(
+            *(
+                torch.where(begins.view(-1, *[1] * own.ndim), own, other)
+                for own, other in zip(initial, anywhere, strict=True)
+            )
+        )
+
+    def _dynamics(self, segments: Segments) -> ExpectedStatistics:
+        """Expectations of the map of each transition, or of the one of all."""
+        expected = mniw.expected_statistics(self.factor)
+        if self.settings.factors == "shared":
+            return expected
+        times = self._weights(segments)[0]
+        return ExpectedStatistics(*(part[times] for part in expected))
+
+    def statistics(self, segments: Segments) -> SmoothedStatistics:  # type: ignore[override]
+        """Of a posterior; differentiable is the KL alone, for nothing else needs it."""
+        assert segments.kl is not None
+        with torch.no_grad():
+            transitions, starts = self._expected(segments)
+        count = len(segments.start) * segments.mean.shape[1]
+        judged = count if segments.live is None else int(segments.live.sum())
+        return SmoothedStatistics(segments.kl.sum(), transitions, starts, judged)
+
+    def _expected(self, segments: Segments) -> tuple[RegressionStatistics, RegressionStatistics]:
+        """Sums of the second moments of (z_{t+1}, [z_t; a; 1]) and of (z_0, 1)."""
+        assert segments.covariance is not None
+        assert segments.cross is not None
+        times, weights, start_weights = self._weights(segments)
+        mean, covariance = segments.mean, segments.covariance
+        x = torch.cat([mean[:, :-1], _inputs(segments.actions)], dim=-1)
+        y = mean[:, 1:]
+        pairs = mniw.regression_statistics(x[:, :, None], y[:, :, None], weights=weights[..., None])
+        of_pairs = _uncertain(
+            pairs, covariance[:, 1:], segments.cross.mT, covariance[:, :-1], weights
+        )
+        if self.settings.factors == "shared":
+            transitions = RegressionStatistics(*(part.sum((0, 1)) for part in of_pairs))
+        else:
+            transitions = RegressionStatistics(
+                *(
+                    torch.zeros_like(prior).index_add(0, times.flatten(), part.flatten(0, 1))
+                    for prior, part in zip(self.prior, of_pairs, strict=True)
+                )
+            )
+        starts = niw.initial_statistics(mean[:, 0], weights=start_weights)
+        uncertain = torch.einsum("s,sij->ij", start_weights, covariance[:, 0])
+        return transitions, starts._replace(yy=starts.yy + uncertain)
+
+    def kl(self, statistics: SmoothedStatistics) -> Tensor:  # type: ignore[override]
+        """KL(q(z) || p(z)) with the expected log p, a frame."""
+        return statistics.kl / statistics.judged
+
+    @torch.no_grad()
+    def conclude(self, episodes: Segments) -> None:
+        """Coordinate ascent: the posterior of z, then that of the parameters, a few times."""
+        for _ in range(ROUNDS if self.settings.closed_form else 1):
+            super().conclude(self.inferred(episodes))
+
+    @torch.no_grad()
+    def given(self, episodes: Segments) -> RegressionStatistics:
+        """The posterior over (F, Sigma) given ``episodes`` alone, as control sees their latents."""
+        seen = self.read(episodes)
+        certain = episodes._replace(mean=seen, variance=torch.zeros_like(seen))
+        d = seen.shape[-1]
+        none = torch.zeros(*seen.shape[:2], d, d).to(seen)
+        pairs, _ = self._expected(certain._replace(covariance=none, cross=none[:, 1:]))
+        return self.prior.plus(pairs)
+
+    def settle(self) -> None:
+        """Filter with the factors of now."""
+        self.read_by = (self.factor, self.initial)
+
+    @torch.no_grad()
+    def read(self, encoded: Segments) -> Float[Tensor, "S L d"]:
+        """Means of the filter."""
+        means, belief = [], None
+        for t in range(encoded.mean.shape[1]):
+            actions = encoded.actions[:, t - 1] if t else None
+            mean, belief = self.follow(
+                encoded.mean[:, t], encoded.variance[:, t], belief, actions, t
+            )
+            means.append(mean)
+        return torch.stack(means, dim=1)
+
+    def follow(
+        self,
+        mean: Float[Tensor, "N d"],
+        variance: Float[Tensor, "N d"],
+        belief: Any,
+        actions: Float[Tensor, "N a"] | None,
+        t: int,
+    ) -> tuple[Float[Tensor, "N d"], lds.Belief]:
+        """One step of the filter: what the last actions did, then what the frame says."""
+        factor, initial = self.read_by
+        if belief is None or actions is None:
+            expected = lds.initial_belief(mniw.expected_statistics(initial))
+        else:
+            at = factor
+            if self.settings.factors == "varying":
+                at = RegressionStatistics(*(part[t - 1] for part in factor))
+            expected = lds.predicted(belief, mniw.expected_statistics(at), _inputs(actions))
+        found = expected.given(lds.Evidence.gaussian(mean, variance))
+        return found.mean, found
+
+    def state_dict(self) -> dict[str, Any]:
+        """Natural parameters of both factors, and of those that the filter uses."""
+        return {**super().state_dict(), "read_by": [list(part) for part in self.read_by]}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take them up."""
+        super().load_state_dict(state)
+        device = self.prior.yy.device
+        factor, initial = (
+            RegressionStatistics(*(part.to(device) for part in parts)) for parts in state["read_by"]
+        )
+        self.read_by = (factor, initial)
+
+
+def _inputs(actions: Float[Tensor, "*batch a"]) -> Float[Tensor, "*batch a1"]:
+    """[a; 1]."""
+    return torch.cat([actions, torch.ones_like(actions[..., :1])], dim=-1)
+
+
+def _uncertain(
+    pairs: RegressionStatistics,
+    yy: Float[Tensor, "S n d d"],
+    yz: Float[Tensor, "S n d d"],
+    zz: Float[Tensor, "S n d d"],
+    weights: Float[Tensor, "S n"],
+) -> RegressionStatistics:
+    """Statistics of single pairs of means, with the covariances of y = z_{t+1} and of z_t in x."""
+    w, (d, p) = weights[..., None, None], pairs.yx.shape[-2:]
+    wide, deep = (0, p - d), (0, p - d, 0, p - d)
+    pad = torch.nn.functional.pad
+    return RegressionStatistics(
+        pairs.yy + w * yy, pairs.yx + pad(w * yz, wide), pairs.xx + pad(w * zz, deep), pairs.n
+    )
+
+
+def linear_dynamics(
+    settings: Dynamics, latent: int, task: TaskSettings, device: str
+) -> BayesianLDS:
+    """SOLAR's prior, with the posterior that the settings name."""
+    kind = SmoothedLDS if settings.posterior == "smoother" else BayesianLDS
+    return kind(settings, latent, task, device)
