@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from solar_cli.inference import mniw, niw
+from solar_cli.inference import lds, mniw, niw
 from solar_cli.models.basis import LatentBasis
 from solar_cli.settings import TaskSettings
 from solar_cli.settings.local import Dynamics
@@ -36,16 +36,14 @@ class Segments(NamedTuple):
     """the frames that count, the first ones of each segment; None where all do"""
     starts: Int[Tensor, " S"] | None = None
     """starts that a segment of each one's episode can have; None for a whole episode's T + 2 - L"""
-    covariance: Float[Tensor, "S L d d"] | None = None
-    """of a posterior whose frames depend on each other; ``variance`` is its diagonal"""
-    cross: Float[Tensor, "S L_1 d d"] | None = None
-    """Cov(z_t, z_{t+1}), as ``covariance``"""
+    smoothed: lds.Smoothed | None = None
+    """of a posterior whose frames depend on each other: all of its moments, hidden latents too"""
     kl: Float[Tensor, " S"] | None = None
-    """KL(q(z) || prior) of each segment, as ``covariance``"""
+    """KL(q(z) || prior) of each segment, where there is ``smoothed``"""
 
     def decoded_from(self, latents: Float[Tensor, "n d"]) -> Float[Tensor, "n d"] | None:
         """``latents`` of this posterior for a decoder; None where they are the encoder's own."""
-        return None if self.covariance is None else latents.float()
+        return None if self.smoothed is None else latents.float()
 
     def counted(self, part: Float[Tensor, "S n *rest"]) -> Float[Tensor, "k *rest"]:
         """Of one value a frame, or a transition to one of the last n frames: those that count."""
@@ -95,6 +93,10 @@ class Prior(Protocol):
     def settle(self) -> None:
         """End a training: what ``read`` and ``follow`` do is as of now, and changes no more."""
 
+    @property
+    def hidden(self) -> int:
+        """Latents that no frame shows: the last ones that are read, beside the encoder's."""
+
     def read(self, encoded: Segments) -> Float[Tensor, "S L d"]:
         """Latents of whole episodes as control sees them: of each frame and those before it."""
 
@@ -143,6 +145,8 @@ class Prior(Protocol):
 
 class MeanField:
     """q(z) is what the encoder says, frame by frame (Eq. 5)."""
+
+    hidden = 0
 
     def inferred(self, encoded: Segments) -> Segments:
         """As encoded."""
@@ -260,8 +264,7 @@ class BayesianLDS(MeanField):
         q = mniw.MNIW(
             Psi=settings.prior_scale * (degrees + d + 1) * torch.eye(d).to(zero),
             nu=degrees,
-            # The mean copies the newest block: latents change little in one step.
-            M=torch.eye(d, p).to(zero),
+            M=self._prior_mean(d, p).to(zero),
             V=torch.eye(p).to(zero) / settings.prior_precision,
         )
         steps = () if settings.factors == "shared" else (task.horizon,)
@@ -279,6 +282,10 @@ class BayesianLDS(MeanField):
             )
         )
         self.initial = self.initial_prior
+
+    def _prior_mean(self, d: int, p: int) -> Float[Tensor, "d p"]:
+        """It copies the newest block: latents change little in one step."""
+        return torch.eye(d, p)
 
     def statistics(self, segments: Segments) -> DynamicsStatistics:
         """Expected sufficient statistics, such that their mean over starts is an episode's."""

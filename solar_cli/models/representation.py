@@ -110,8 +110,8 @@ class Representation:
 
     @property
     def latent(self) -> int:
-        """d: latents of one frame."""
-        return self.settings.representation.latent
+        """d: latents of one time step."""
+        return self.settings.representation.latent + self._model.prior.hidden
 
     @property
     def state_size(self) -> int:
@@ -318,7 +318,9 @@ class Representation:
 
     def _whitening(self, encoded: Segments) -> LatentBasis:
         latents = self._model.prior.read(encoded)
-        return LatentBasis.whitening(encoded.counted(self._windows(latents)))
+        return LatentBasis.whitening(
+            encoded.counted(self._windows(latents)), self._model.prior.hidden
+        )
 
     def _parameters(self) -> dict[str, Any]:
         networks = {

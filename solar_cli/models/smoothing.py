@@ -31,6 +31,8 @@ from solar_cli.models.priors import BayesianLDS, Segments
 from solar_cli.settings import TaskSettings
 from solar_cli.settings.local import Dynamics
 
+PACE = 0.1
+"""how much a hidden latent is expected to move the one it drives, in a step; both are of order 1"""
 ROUNDS = 5
 """of coordinate ascent at the end of a training: each smooths, then gives the factors in closed
 form"""
@@ -59,14 +61,29 @@ class SmoothedLDS(BayesianLDS):
                 "dynamics.posterior = 'smoother' sees single frames: set task.observation.window = "
                 f"1, not {task.observation.window}"
             )
-        super().__init__(settings, latent, task, device)
-        self.latent = latent
+        self.hidden = settings.hidden
+        self.shown = latent
+        super().__init__(settings, latent + settings.hidden, task, device)
         self.read_by = (self.factor, self.initial)
         """the factors that control's filter uses"""
 
+    def _prior_mean(self, d: int, p: int) -> Float[Tensor, "d p"]:
+        """Latents change little in one step; each hidden one is the velocity of a shown one."""
+        mean = super()._prior_mean(d, p)
+        mean[: self.shown, self.shown : d] = PACE * torch.eye(self.shown, self.hidden)
+        return mean
+
+    def _evidence(
+        self, mean: Float[Tensor, "*batch shown"], variance: Float[Tensor, "*batch shown"]
+    ) -> lds.Evidence:
+        """What frames say of all latents: of hidden ones nothing."""
+        shown = lds.Evidence.gaussian(mean, variance)
+        pad = torch.nn.functional.pad
+        return lds.Evidence(*(pad(part, (0, self.hidden)) for part in shown))
+
     def inferred(self, encoded: Segments) -> Segments:
         """Marginals of the chain, and what they cost; differentiable in what is encoded."""
-        evidence = lds.Evidence.gaussian(encoded.mean, encoded.variance)
+        evidence = self._evidence(encoded.mean, encoded.variance)
         chain = lds.prior_chain(
             self._starts(encoded.start),
             self._dynamics(encoded),
@@ -81,27 +98,27 @@ class SmoothedLDS(BayesianLDS):
         second_moment = found.mean.square() + variance
         added = evidence.linear * found.mean - 0.5 * evidence.precision * second_moment
         return encoded._replace(
-            mean=found.mean,
-            variance=variance,
-            covariance=found.covariance,
-            cross=found.cross,
+            mean=found.mean[..., : self.shown],
+            variance=variance[..., : self.shown],
+            smoothed=found,
             kl=added.sum((-2, -1)) - found.log_normaliser,
         )
 
     def sampled(
-        self, encoded: Segments, noise: Float[Tensor, "S L d"]
-    ) -> tuple[Float[Tensor, "S L d"], Segments]:
-        """Of each frame's marginal."""
+        self, encoded: Segments, noise: Float[Tensor, "S L shown"]
+    ) -> tuple[Float[Tensor, "S L shown"], Segments]:
+        """Of the marginal of what each frame shows."""
         doubles = encoded._replace(mean=encoded.mean.double(), variance=encoded.variance.double())
         posterior = self.inferred(doubles)
-        assert posterior.covariance is not None
-        spread = torch.linalg.cholesky(posterior.covariance) @ noise.double().unsqueeze(-1)
+        assert posterior.smoothed is not None
+        shown = posterior.smoothed.covariance[..., : self.shown, : self.shown]
+        spread = torch.linalg.cholesky(shown) @ noise.double().unsqueeze(-1)
         return (posterior.mean + spread.squeeze(-1)).float(), posterior
 
     def _starts(self, start: Int[Tensor, " S"]) -> ExpectedStatistics:
         """The Gaussian of each segment's first state."""
         initial = mniw.expected_statistics(self.initial)
-        eye = torch.eye(self.latent).to(initial.precision)
+        eye = torch.eye(len(initial.precision)).to(initial.precision)
         zero = torch.zeros_like
         anywhere = ExpectedStatistics(eye, *(zero(part) for part in initial[1:]))
         begins = start == 0
@@ -122,25 +139,24 @@ class SmoothedLDS(BayesianLDS):
 
     def statistics(self, segments: Segments) -> SmoothedStatistics:  # type: ignore[override]
         """Of a posterior; differentiable is the KL alone, for nothing else needs it."""
+        assert segments.smoothed is not None
         assert segments.kl is not None
         with torch.no_grad():
-            transitions, starts = self._expected(segments)
+            transitions, starts = self._expected(segments, segments.smoothed)
         count = len(segments.start) * segments.mean.shape[1]
         judged = count if segments.live is None else int(segments.live.sum())
         return SmoothedStatistics(segments.kl.sum(), transitions, starts, judged)
 
-    def _expected(self, segments: Segments) -> tuple[RegressionStatistics, RegressionStatistics]:
+    def _expected(
+        self, segments: Segments, of: lds.Smoothed
+    ) -> tuple[RegressionStatistics, RegressionStatistics]:
         """Sums of the second moments of (z_{t+1}, [z_t; a; 1]) and of (z_0, 1)."""
-        assert segments.covariance is not None
-        assert segments.cross is not None
         times, weights, start_weights = self._weights(segments)
-        mean, covariance = segments.mean, segments.covariance
+        mean, covariance = of.mean, of.covariance
         x = torch.cat([mean[:, :-1], _inputs(segments.actions)], dim=-1)
         y = mean[:, 1:]
         pairs = mniw.regression_statistics(x[:, :, None], y[:, :, None], weights=weights[..., None])
-        of_pairs = _uncertain(
-            pairs, covariance[:, 1:], segments.cross.mT, covariance[:, :-1], weights
-        )
+        of_pairs = _uncertain(pairs, covariance[:, 1:], of.cross.mT, covariance[:, :-1], weights)
         if self.settings.factors == "shared":
             transitions = RegressionStatistics(*(part.sum((0, 1)) for part in of_pairs))
         else:
@@ -168,11 +184,9 @@ class SmoothedLDS(BayesianLDS):
     def given(self, episodes: Segments) -> RegressionStatistics:
         """The posterior over (F, Sigma) given ``episodes`` alone, as control sees their latents."""
         seen = self.read(episodes)
-        certain = episodes._replace(mean=seen, variance=torch.zeros_like(seen))
-        d = seen.shape[-1]
-        none = torch.zeros(*seen.shape[:2], d, d).to(seen)
-        pairs, _ = self._expected(certain._replace(covariance=none, cross=none[:, 1:]))
-        return self.prior.plus(pairs)
+        certain = torch.zeros(*seen.shape, seen.shape[-1]).to(seen)
+        of = lds.Smoothed(seen, certain, certain[:, 1:], seen.new_zeros(len(seen)))
+        return self.prior.plus(self._expected(episodes, of)[0])
 
     def settle(self) -> None:
         """Filter with the factors of now."""
@@ -207,7 +221,7 @@ class SmoothedLDS(BayesianLDS):
             if self.settings.factors == "varying":
                 at = RegressionStatistics(*(part[t - 1] for part in factor))
             expected = lds.predicted(belief, mniw.expected_statistics(at), _inputs(actions))
-        found = expected.given(lds.Evidence.gaussian(mean, variance))
+        found = expected.given(self._evidence(mean, variance))
         return found.mean, found
 
     def state_dict(self) -> dict[str, Any]:

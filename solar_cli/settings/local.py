@@ -70,6 +70,12 @@ class Dynamics(Settings):
         "Eq. 5; the authors' release smooths",
         added="mean-field",
     )
+    hidden: int = setting(
+        0,
+        "smoother: further latents that no single frame shows, velocities; the release has none",
+        ge=0,
+        added=0,
+    )
     factors: Literal["shared", "varying"] = setting(
         "shared", "one q(F, Sigma) for all time steps, or one a time step as in Eq. 5"
     )
@@ -82,6 +88,12 @@ class Dynamics(Settings):
     closed_form: bool = setting(
         True, "end a training with the exact posterior: a step of rate 1 on the whole data"
     )
+
+    @model_validator(mode="after")
+    def _hidden_is_inferred(self) -> Self:
+        if self.hidden and self.posterior != "smoother":
+            raise ValueError("hidden: only posterior = 'smoother' infers what no frame shows")
+        return self
 
 
 class Training(Settings):
