@@ -150,6 +150,19 @@ def test_only_the_newest_frame_is_encoded_at_each_step():
         np.testing.assert_array_equal(encoded, seen[:, t])
 
 
+def test_an_embedding_is_handed_its_belief_and_what_was_done_since():
+    embedding = Embedding()
+    policy = LatentPolicy(gains(), embedding, W, 0.0)
+    actions, _ = run(policy, frames(), np.random.default_rng(0))
+    for t, (step, belief, done) in enumerate(embedding.carried):
+        assert step == t
+        assert belief == (t - 1 if t else None)  # it returns the time step
+        if t:
+            np.testing.assert_array_equal(done, actions[:, t - 1])
+        else:
+            assert done is None
+
+
 def test_an_untrained_embedding_is_never_asked():
     embedding = Embedding(trained=False)
     policy = LatentPolicy(gains(), embedding, W, 0.0)
