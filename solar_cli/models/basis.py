@@ -30,8 +30,9 @@ class LatentBasis(NamedTuple):
         _, window, d = windows.shape
         newest = windows[:, 0]
         centre = newest.mean(dim=0)
-        blocks = (newest - centre).split([d - hidden, hidden] if hidden else [d], dim=1)
-        white = torch.block_diag(*(_decorrelating(block) for block in blocks))
+        white = torch.zeros(d, d, dtype=windows.dtype, device=windows.device)
+        for block in (slice(d - hidden), slice(d - hidden, d))[: 2 if hidden else 1]:
+            white[block, block] = _decorrelating((newest - centre)[:, block])
         size = window * d
         A = torch.zeros(size, size, dtype=windows.dtype, device=windows.device)
         A[:d, :d] = white
@@ -78,4 +79,5 @@ def _decorrelating(centred: Float[Tensor, "n d"]) -> Float[Tensor, "d d"]:
     d = centred.shape[1]
     values, vectors = torch.linalg.eigh(centred.T.cov().reshape(d, d))
     floor = LEAST_SHARE * values[-1].clamp_min(1e-12)
-    return vectors.T / values.clamp_min(floor).sqrt()[:, None]
+    matrix: Tensor = vectors.T / values.clamp_min(floor).sqrt()[:, None]
+    return matrix

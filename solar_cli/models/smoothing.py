@@ -155,20 +155,42 @@ class SmoothedLDS(BayesianLDS):
         mean, covariance = of.mean, of.covariance
         x = torch.cat([mean[:, :-1], _inputs(segments.actions)], dim=-1)
         y = mean[:, 1:]
-        pairs = mniw.regression_statistics(x[:, :, None], y[:, :, None], weights=weights[..., None])
-        of_pairs = _uncertain(pairs, covariance[:, 1:], of.cross.mT, covariance[:, :-1], weights)
         if self.settings.factors == "shared":
-            transitions = RegressionStatistics(*(part.sum((0, 1)) for part in of_pairs))
-        else:
-            transitions = RegressionStatistics(
-                *(
-                    torch.zeros_like(prior).index_add(0, times.flatten(), part.flatten(0, 1))
-                    for prior, part in zip(self.prior, of_pairs, strict=True)
-                )
+            certain = mniw.regression_statistics(
+                x.flatten(0, 1), y.flatten(0, 1), weights=weights.flatten()
             )
+        else:
+            # One "sample axis" of length 1 a transition, then summed by time step.
+            single = mniw.regression_statistics(x[:, :, None], y[:, :, None])
+            certain = RegressionStatistics(*(self._summed(p, times, weights) for p in single))
+        yy, yz, zz = (
+            self._summed(part, times, weights)
+            for part in (covariance[:, 1:], of.cross.mT, covariance[:, :-1])
+        )
+        known = x.shape[-1] - y.shape[-1]
+        pad = torch.nn.functional.pad
+        transitions = certain.plus(
+            RegressionStatistics(
+                yy, pad(yz, (0, known)), pad(zz, (0, known, 0, known)), 0 * certain.n
+            )
+        )
         starts = niw.initial_statistics(mean[:, 0], weights=start_weights)
         uncertain = torch.einsum("s,sij->ij", start_weights, covariance[:, 0])
         return transitions, starts._replace(yy=starts.yy + uncertain)
+
+    def _summed(
+        self,
+        values: Float[Tensor, "S n *rest"],
+        times: Int[Tensor, "S n"],
+        weights: Float[Tensor, "S n"],
+    ) -> Float[Tensor, "*T rest"]:
+        """Weighed sums over transitions: over all, or those of each time step."""
+        if self.settings.factors == "shared":
+            total: Tensor = torch.tensordot(weights, values, dims=2)
+            return total
+        weighed = values * weights.view(*weights.shape, *[1] * (values.ndim - 2))
+        sums = torch.zeros(self.horizon, *values.shape[2:]).to(values)
+        return sums.index_add(0, times.flatten(), weighed.flatten(0, 1))
 
     def kl(self, statistics: SmoothedStatistics) -> Tensor:  # type: ignore[override]
         """KL(q(z) || p(z)) with the expected log p, a frame."""
@@ -241,22 +263,6 @@ class SmoothedLDS(BayesianLDS):
 def _inputs(actions: Float[Tensor, "*batch a"]) -> Float[Tensor, "*batch a1"]:
     """[a; 1]."""
     return torch.cat([actions, torch.ones_like(actions[..., :1])], dim=-1)
-
-
-def _uncertain(
-    pairs: RegressionStatistics,
-    yy: Float[Tensor, "S n d d"],
-    yz: Float[Tensor, "S n d d"],
-    zz: Float[Tensor, "S n d d"],
-    weights: Float[Tensor, "S n"],
-) -> RegressionStatistics:
-    """Statistics of single pairs of means, with the covariances of y = z_{t+1} and of z_t in x."""
-    w, (d, p) = weights[..., None, None], pairs.yx.shape[-2:]
-    wide, deep = (0, p - d), (0, p - d, 0, p - d)
-    pad = torch.nn.functional.pad
-    return RegressionStatistics(
-        pairs.yy + w * yy, pairs.yx + pad(w * yz, wide), pairs.xx + pad(w * zz, deep), pairs.n
-    )
 
 
 def linear_dynamics(
