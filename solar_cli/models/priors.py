@@ -94,10 +94,6 @@ class Prior(Protocol):
         """End a training: what ``read`` and ``follow`` do is as of now, and changes no more."""
 
     @property
-    def reads_by_newest(self) -> bool:
-        """Whether it is to settle in every iteration, trained or not."""
-
-    @property
     def hidden(self) -> int:
         """Latents that no frame shows: the last ones that are read, beside the encoder's."""
 
@@ -151,7 +147,6 @@ class MeanField:
     """q(z) is what the encoder says, frame by frame (Eq. 5)."""
 
     hidden = 0
-    reads_by_newest = False
 
     def inferred(self, encoded: Segments) -> Segments:
         """As encoded."""

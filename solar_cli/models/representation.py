@@ -128,9 +128,6 @@ class Representation:
         else:
             metrics = self._judge(newest)
             self._conclude(recent)
-            if self._model.prior.reads_by_newest:
-                self._model.prior.settle()
-                self.moved_in = experience.iteration
         return {**metrics, **self._model.prior.metrics()}
 
     def _train_first(self, iteration: int, batches: list[Episodes]) -> dict[str, float]:

@@ -62,7 +62,6 @@ class SmoothedLDS(BayesianLDS):
                 f"1, not {task.observation.window}"
             )
         self.hidden = settings.hidden
-        self.reads_by_newest = settings.filter == "newest"
         self.shown = latent
         super().__init__(settings, latent + settings.hidden, task, device)
         self.read_by = (self.factor, self.initial)

@@ -76,12 +76,6 @@ class Dynamics(Settings):
         ge=0,
         added=0,
     )
-    filter: Literal["trained", "newest"] = setting(
-        "trained",
-        "smoother: the filter has the dynamics of the last training, or of the last B iterations, "
-        "and line 6 carries the policy over",
-        added="trained",
-    )
     factors: Literal["shared", "varying"] = setting(
         "shared", "one q(F, Sigma) for all time steps, or one a time step as in Eq. 5"
     )

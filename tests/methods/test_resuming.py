@@ -20,7 +20,7 @@ SMOOTHER = ('dynamics.posterior="smoother"', "dynamics.hidden=2")
         ("solar", ("training.attempts=2", *FLOORS), 2 * 3),
         ("solar", ('dynamics.factors="varying"', 'dynamics.rows="all"'), 3),
         ("solar", (*FINE_TUNING, *SMOOTHER), 3 + 2 + 2),
-        ("solar", (*SMOOTHER, 'dynamics.factors="varying"', 'dynamics.filter="newest"'), 3),
+        ("solar", (*SMOOTHER, 'dynamics.factors="varying"'), 3),
         ("vae", FINE_TUNING, 3 + 2 + 2),
     ],
     ids=[

@@ -507,22 +507,6 @@ def test_a_frozen_smoothers_states_stay_what_they_are():
     assert digest(own_factor(model)) != digest(factor)
 
 
-def test_a_filter_of_the_newest_dynamics_moves_the_states_in_every_iteration():
-    task = vector_task(horizon=7)
-    first, second = vector_episodes(task, 14), vector_episodes(task, 6, seed=7)
-    model = make(task=task, dynamics={**SMOOTHER, "filter": "newest"})
-    model.update(Collected(first))
-    states, networks = model.embed(second), digest(model.state_dict()["parameters"]["networks"])
-    model.update(Collected(first, second))
-    assert model.moved_in == 2
-    assert digest(model.state_dict()["parameters"]["networks"]) == networks
-    assert not torch.allclose(model.embed(second), states)
-    prior = model._model.prior
-    read = prior.read(model._model.encoded(second, "cpu"))
-    prior.settle()  # it is settled already
-    assert torch.equal(prior.read(model._model.encoded(second, "cpu")), read)
-
-
 def test_hidden_latents_stay_the_last_entries_of_a_state():
     """Frames tell of the others alone: costs are fitted to them, and white they are apart."""
     task = vector_task(horizon=7)
