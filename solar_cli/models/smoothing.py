@@ -3,15 +3,19 @@
 The encoder gives evidence about each z_t, a Gaussian factor; q(z_0..z_T) is the linear-Gaussian
 chain under q(F, Sigma) with that evidence (Johnson et al. 2016; the authors' release of SOLAR). A
 latent that no single frame shows, a velocity, is inferred from those before and after. Control has
-only those before: it sees the mean of the filter, whose dynamics stay as the last training left
-them, so that a state keeps its meaning. If they are right, that mean is a Markov process with the
-same F, driven by innovations: what local dynamics and costs are fitted to is what the policy acts
-on.
+only those before: it sees the mean of the filter. If the dynamics are right, that mean is a Markov
+process with the same F, driven by innovations: what local dynamics and costs are fitted to is what
+the policy acts on. The filter keeps the dynamics of the last training, so that a state keeps its
+meaning. Taking up those of the newest batches in every iteration, with line 6 between, predicted
+more of a step and controlled no better: `reacher` after 660 episodes, -6.5 and -7.6 on two seeds, in
+place of -5.6 and -7.8.
 
-Ours: one block Cholesky factorisation in place of an unrolled log-normaliser that is differentiated
-twice; no expectation-maximisation within line 7, which sees filtered means; factors that are
-concluded by coordinate ascent, which has none of the bias of natural-gradient steps on minibatches
-of a q(z) that depends on the factors itself.
+Ours: ``hidden`` latents, of which frames say nothing and which the decoder does not see. Where the
+encoder may say something of every latent, it makes all of them positions: with ten of those on
+`reacher`, local dynamics predicted 1 % of a step's variance. One block Cholesky factorisation in
+place of an unrolled log-normaliser that is differentiated twice. No expectation-maximisation within
+line 7, which sees filtered means. Factors are concluded by coordinate ascent, which has none of the
+bias of natural-gradient steps on minibatches of a q(z) that depends on the factors itself.
 
 Axes as in `priors`, with windows of one frame.
 """
