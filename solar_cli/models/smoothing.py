@@ -7,8 +7,8 @@ only those before: it sees the mean of the filter. If the dynamics are right, th
 process with the same F, driven by innovations: what local dynamics and costs are fitted to is what
 the policy acts on. The filter keeps the dynamics of the last training, so that a state keeps its
 meaning. Taking up those of the newest batches in every iteration, with line 6 between, predicted
-more of a step and controlled no better: `reacher` after 660 episodes, -6.5 and -7.6 on two seeds, in
-place of -5.6 and -7.8.
+more of a step and controlled no better: `reacher` after 660 episodes, -6.5 and -7.6 on two seeds,
+in place of -5.6 and -7.8.
 
 Ours: ``hidden`` latents, of which frames say nothing and which the decoder does not see. Where the
 encoder may say something of every latent, it makes all of them positions: with ten of those on
