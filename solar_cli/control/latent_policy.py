@@ -26,21 +26,40 @@ class Embedding(Protocol):
     def basis(self) -> LatentBasis:
         """From windows of latents to states."""
 
-    def encode(self, frames: NDArray[Any]) -> Float[Tensor, "n d"]:
-        """Latents of single frames."""
+    def follow(
+        self, frames: NDArray[Any], t: int, belief: Any, actions: Float[Tensor, "N a"] | None
+    ) -> tuple[Float[Tensor, "N d"], Any]:
+        """Latents of the newest frames, and the belief for the next step.
+
+        ``belief`` and ``actions`` are the step before's, None at the start.
+        """
+
+
+class Followed(NamedTuple):
+    """What is carried of an episode's frames."""
+
+    latents: tuple[Tensor, ...] = ()
+    """(N, d) of the window's frames, newest first"""
+    belief: Any = None
+    """what the embedding carries"""
 
 
 def latest_state(
-    embedding: Embedding, observations: NDArray[Any], latents: tuple[Tensor, ...], window: int
-) -> tuple[Float[Tensor, "N z"], tuple[Tensor, ...]]:
-    """The state that windows of frames end in, given the ``latents`` of the frames before.
+    embedding: Embedding,
+    observations: NDArray[Any],
+    t: int,
+    before: Followed,
+    actions: Float[Tensor, "N a"] | None,
+    window: int,
+) -> tuple[Float[Tensor, "N z"], Followed]:
+    """The state that windows of frames end in, and what is to be given with the next ones.
 
-    Only the newest frame is encoded; the second result is to be given with the next observation.
+    Only the newest frame is encoded; ``actions`` are those of the step before, None at the start.
     """
-    newest = embedding.encode(observations[:, -1])
+    newest, belief = embedding.follow(observations[:, -1], t, before.belief, actions)
     # Before the start of an episode its first frame repeats.
-    latents = (newest, *(latents or (newest,) * window))[:window]
-    return embedding.basis.state(torch.stack(latents, dim=1)), latents
+    latents = (newest, *(before.latents or (newest,) * window))[:window]
+    return embedding.basis.state(torch.stack(latents, dim=1)), Followed(latents, belief)
 
 
 class Acting(NamedTuple):
@@ -48,8 +67,9 @@ class Acting(NamedTuple):
 
     noise: Float[Tensor, "N T a"] | None
     """unit-variance noise, or None for a noise-free policy"""
-    latents: tuple[Tensor, ...]
-    """(N, d) latents of the window's frames, newest first"""
+    followed: Followed = Followed()
+    actions: Float[Tensor, "N a"] | None = None
+    """of the step before"""
 
 
 class LatentPolicy:
@@ -67,21 +87,24 @@ class LatentPolicy:
     def start(self, episodes: int, stream: np.random.Generator | None) -> Acting:
         """Draw the noise of whole episodes."""
         if stream is None:
-            return Acting(None, ())
+            return Acting(None)
         horizon, size = self.gains.k.shape
         noise = smooth_noise((episodes, horizon, size), self.smoothing, stream)
-        return Acting(torch.from_numpy(noise), ())
+        return Acting(torch.from_numpy(noise))
 
     def act(
         self, observations: NDArray[Any], t: int, state: Acting
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], Acting]:
         """Actions, their means and the state; only the newest frame is encoded."""
         mean = self.gains.k[t].expand(len(observations), -1)
-        latents = state.latents
+        followed = state.followed
         if self.embedding.trained:
-            z, latents = latest_state(self.embedding, observations, latents, self.window)
+            z, followed = latest_state(
+                self.embedding, observations, t, followed, state.actions, self.window
+            )
             mean = z.cpu() @ self.gains.K[t].T + self.gains.k[t]
         action = mean
         if state.noise is not None:
             action = mean + state.noise[:, t] @ self._spread[t].T
-        return action.numpy(), mean.numpy().copy(), Acting(state.noise, latents)
+        acted = Acting(state.noise, followed, action)
+        return action.numpy().copy(), mean.numpy().copy(), acted

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from solar_cli.control.exploration import smooth_noise
-from solar_cli.control.latent_policy import Embedding, latest_state
+from solar_cli.control.latent_policy import Embedding, Followed, latest_state
 from solar_cli.settings import TaskSettings
 
 Floats = NDArray[np.float64]
@@ -31,9 +31,10 @@ class Acting(NamedTuple):
 
     noise: Floats
     """(N, T, a)"""
-    latents: tuple[Tensor, ...]
-    """(N, d) of the window's frames, newest first"""
-    plan: Float[Tensor, "N H a"] | None
+    followed: Followed = Followed()
+    plan: Float[Tensor, "N H a"] | None = None
+    actions: Float[Tensor, "N a"] | None = None
+    """of the step before"""
 
 
 class PlanningPolicy:
@@ -54,8 +55,8 @@ class PlanningPolicy:
         """Draw the noise of whole episodes."""
         shape = (episodes, self.task.horizon, self.task.action.size)
         if stream is None:
-            return Acting(np.zeros(shape), (), None)
-        return Acting(self.std * smooth_noise(shape, self.smoothing, stream), (), None)
+            return Acting(np.zeros(shape))
+        return Acting(self.std * smooth_noise(shape, self.smoothing, stream))
 
     @torch.no_grad()
     def act(
@@ -63,7 +64,11 @@ class PlanningPolicy:
     ) -> tuple[Floats, Floats, Acting]:
         """As `Policy.act`; only the newest frame is encoded."""
         window = self.task.observation.window
-        z, latents = latest_state(self.embedding, observations, state.latents, window)
+        z, followed = latest_state(
+            self.embedding, observations, t, state.followed, state.actions, window
+        )
         plan = self.planner(z.float(), t, state.plan)
         mean = plan[:, 0].double().cpu().numpy()
-        return mean + state.noise[:, t], mean, Acting(state.noise, latents, plan)
+        action = mean + state.noise[:, t]
+        acted = Acting(state.noise, followed, plan, torch.from_numpy(action.copy()))
+        return action, mean, acted

@@ -120,9 +120,11 @@ class TrueState(Representation):
             self._model.networks.standardise_by(
                 torch.from_numpy(first).flatten(0, 1).to(self.device)
             )
-            self._basis = self._whitening(self._posterior(recent))
-            self._trained, self.moved_in = True, experience.iteration
         self._conclude(recent)
+        if not self._trained:
+            self._model.prior.settle()
+            self._basis = self._whitening(self._encoded(recent))
+            self._trained, self.moved_in = True, experience.iteration
         return self._model.prior.metrics()
 
 

@@ -29,8 +29,9 @@ from solar_cli.errors import UsageError
 from solar_cli.methods.latent import LatentLearner
 from solar_cli.models.neural import NeuralCost, NeuralDynamics, Sequences
 from solar_cli.models.neural_fit import NeuralModel, NeuralTrainer
-from solar_cli.models.priors import BayesianLDS, Prior
+from solar_cli.models.priors import Prior
 from solar_cli.models.representation import Representation
+from solar_cli.models.smoothing import linear_dynamics
 from solar_cli.pulse import Diverged, Pulse
 from solar_cli.settings import TaskSettings
 from solar_cli.settings.global_mpc import GlobalMpc as GlobalMpcSettings
@@ -68,7 +69,7 @@ class GlobalMpc(LatentLearner):
 
     def make_prior(self) -> Prior:
         """SOLAR's (Eq. 2 and 3)."""
-        return BayesianLDS(self.settings.dynamics, self.latent, self.task, self.device)
+        return linear_dynamics(self.settings.dynamics, self.latent, self.task, self.device)
 
     @property
     def policy(self) -> Policy:

@@ -53,13 +53,12 @@ class LatentLearner(ABC):
         return latent_metrics(latents, evaluation.truth[live], evaluation.truth_names)
 
     def encode(self, episodes: Episodes) -> NDArray[Any] | None:
-        """Latents by the encoder's mean, as they are before whitening."""
+        """Latents as control sees them, before whitening."""
         if not self.representation.trained:
             return None
-        every = episodes.frames.reshape(-1, *episodes.frames.shape[2:])
-        latents = self.representation.encode(every).cpu().numpy()
-        return latents.reshape(*episodes.frames.shape[:2], -1)
+        found: NDArray[Any] = self.representation.latents(episodes).cpu().numpy()
+        return found
 
     def reconstruct(self, episodes: Episodes) -> NDArray[Any] | None:
-        """Frames as the observation model expects them from the encoder's mean."""
+        """Frames as the observation model expects them from the posterior's mean."""
         return self.representation.reconstruct(episodes) if self.representation.trained else None

@@ -73,7 +73,7 @@ class MpcNn(Learner):
         experience.collect(self.policy, settings.initial if first else settings.episodes)
         every = [experience.batch(name) for name in experience.batches()]
         seen = [
-            Sequences.of(self.states.encode(episodes.frames), episodes, self.task.action_cost)
+            Sequences.of(self.states.of(episodes.frames), episodes, self.task.action_cost)
             for episodes in every
         ]
         if not all(bool(torch.isfinite(batch.states).all()) for batch in seen):
@@ -109,6 +109,12 @@ class States:
         self.basis = LatentBasis(torch.eye(size, device=device), torch.zeros(size, device=device))
         self._device = device
 
-    def encode(self, frames: NDArray[Any]) -> Float[Tensor, "*n d"]:
+    def follow(
+        self, frames: NDArray[Any], t: int, belief: Any, actions: Float[Tensor, "N a"] | None
+    ) -> tuple[Float[Tensor, "N d"], Any]:
+        """The states; nothing is carried."""
+        return self.of(frames), None
+
+    def of(self, frames: NDArray[Any]) -> Float[Tensor, "*n d"]:
         """The states."""
         return torch.from_numpy(np.ascontiguousarray(frames, np.float32)).to(self._device)

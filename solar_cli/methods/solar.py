@@ -10,7 +10,8 @@ from __future__ import annotations
 from solar_cli.control.lqr import improve_policy
 from solar_cli.episodes import Experience
 from solar_cli.methods.local import LocalLearner
-from solar_cli.models.priors import BayesianLDS, Prior
+from solar_cli.models.priors import Prior
+from solar_cli.models.smoothing import linear_dynamics
 from solar_cli.settings.local import Solar as SolarSettings
 
 
@@ -20,7 +21,7 @@ class Solar(LocalLearner):
     def make_prior(self) -> Prior:
         """The prior over latents that the representation is trained with (Eq. 2 and 3)."""
         assert isinstance(self.settings, SolarSettings)
-        return BayesianLDS(self.settings.dynamics, self.latent, self.task, self.device)
+        return linear_dynamics(self.settings.dynamics, self.latent, self.task, self.device)
 
     def iterate(self, experience: Experience) -> dict[str, float]:
         """One turn of Algorithm 1 (lines 4 to 8)."""

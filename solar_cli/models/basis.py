@@ -30,14 +30,17 @@ class LatentBasis(NamedTuple):
     b: Float[Tensor, " Wd"]
 
     @staticmethod
-    def whitening(windows: Float[Tensor, "n W d"]) -> LatentBasis:
-        """Newest latents decorrelated to unit variance, differences scaled to unit std each."""
+    def whitening(windows: Float[Tensor, "n W d"], hidden: int = 0) -> LatentBasis:
+        """Newest latents decorrelated to unit variance, differences scaled to unit std each.
+
+        The ``hidden`` latents, the last ones, are decorrelated apart: they stay the last ones.
+        """
         _, window, d = windows.shape
         newest = windows[:, 0]
         centre = newest.mean(dim=0)
-        values, vectors = torch.linalg.eigh((newest - centre).T.cov().reshape(d, d))
-        floor = LEAST_SHARE * values[-1].clamp_min(1e-12)
-        white = vectors.T / values.clamp_min(floor).sqrt()[:, None]
+        white = torch.zeros(d, d, dtype=windows.dtype, device=windows.device)
+        for block in (slice(d - hidden), slice(d - hidden, d))[: 2 if hidden else 1]:
+            white[block, block] = _decorrelating((newest - centre)[:, block])
         size = window * d
         A = torch.zeros(size, size, dtype=windows.dtype, device=windows.device)
         A[:d, :d] = white
@@ -84,3 +87,12 @@ class LatentBasis(NamedTuple):
         R[latents, -1] = self.b
         R[rest, rest] = torch.eye(actions + 1).to(self.A)
         return R
+
+
+def _decorrelating(centred: Float[Tensor, "n d"]) -> Float[Tensor, "d d"]:
+    """The matrix to unit variance in every direction that varies."""
+    d = centred.shape[1]
+    values, vectors = torch.linalg.eigh(centred.T.cov().reshape(d, d))
+    floor = LEAST_SHARE * values[-1].clamp_min(1e-12)
+    matrix: Tensor = vectors.T / values.clamp_min(floor).sqrt()[:, None]
+    return matrix

@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from solar_cli.models.priors import Segments, regressors
+from solar_cli.models.priors import MeanField, Segments, regressors
 from solar_cli.models.transition import Local, TransitionNetwork, perceptron
 from solar_cli.pulse import Diverged
 from solar_cli.settings import TaskSettings
@@ -53,7 +53,7 @@ class Transitions(NamedTuple):
         return Transitions(*(part[rows] for part in self))
 
 
-class ControllableEmbedding:
+class ControllableEmbedding(MeanField):
     """RCE's terms of the bound; q(z^ | x') is the encoder too, as p(z | x) is."""
 
     factor = None

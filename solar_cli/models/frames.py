@@ -101,7 +101,7 @@ class FrameModel(nn.Module):
     def encode(
         self, scaled: Float[Tensor, "n *frame"]
     ) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d"]]:
-        """Mean and variance of q(z | s)."""
+        """Mean and variance of what a frame says of its latents: of q(z | s) in a mean field."""
         features = self.body(scaled)
         mean = self.mean(features)
         if self.log_variance is None:
@@ -118,9 +118,13 @@ class FrameModel(nn.Module):
             return calibrated(outputs, scaled, settings.nats, settings.pyramid)
         return UNCALIBRATED[settings.likelihood](outputs, scaled)
 
-    def reconstruct(self, scaled: Float[Tensor, "n *frame"]) -> Float[Tensor, "n *frame"]:
-        """The expected frame for the encoder's mean, as scaled frames."""
-        return mean_frame(self.decoder(self.encode(scaled)[0]), scaled, self.settings.likelihood)
+    def reconstruct(
+        self, scaled: Float[Tensor, "n *frame"], latents: Float[Tensor, "n d"] | None = None
+    ) -> Float[Tensor, "n *frame"]:
+        """The expected frame for ``latents``, the encoder's mean by default, as scaled frames."""
+        if latents is None:
+            latents = self.encode(scaled)[0]
+        return mean_frame(self.decoder(latents), scaled, self.settings.likelihood)
 
     def as_frames(self, scaled: Float[Tensor, "n *frame"]) -> Tensor:
         """Scaled frames in stored units."""

@@ -49,19 +49,13 @@ class LatentModel:
         over the frames that were drawn, of which the first and last of an episode are fewer.
         """
         scaled = self.networks.scaled(batch.frames.flatten(0, 1))
-        mean, variance = self.networks.encode(scaled)
-        sample = mean + variance.sqrt() * batch.noise.flatten(0, 1)
-        reconstruction = self.networks.reconstruction_loss(
-            sample.index_select(0, batch.decoded), scaled.index_select(0, batch.decoded)
-        )
         shape = (*batch.frames.shape[:2], -1)
-        segments = Segments(
-            mean.view(shape).double(),
-            variance.view(shape).double(),
-            batch.actions,
-            batch.start,
-            starts=batch.starts,
-            noise=batch.noise.double(),
+        mean, variance = (part.view(shape) for part in self.networks.encode(scaled))
+        encoded = Segments(mean, variance, batch.actions, batch.start, starts=batch.starts)
+        sample, segments = self.prior.sampled(encoded, batch.noise)
+        reconstruction = self.networks.reconstruction_loss(
+            sample.flatten(0, 1).index_select(0, batch.decoded),
+            scaled.index_select(0, batch.decoded),
         )
         statistics = self.prior.statistics(segments)
         kl = self.prior.kl(statistics)
@@ -73,7 +67,7 @@ class LatentModel:
 
     @torch.no_grad()
     def embed(self, frames: Tensor) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d"]]:
-        """Mean and variance of q(z | s), float64, for frames as stored; each frame once."""
+        """The encoder's mean and variance, float64, for frames as stored; each frame once."""
         parts = [
             self.networks.encode(self.networks.scaled(chunk))
             for chunk in torch.split(frames, CHUNK)
@@ -81,8 +75,8 @@ class LatentModel:
         mean, variance = (torch.cat(part).double() for part in zip(*parts, strict=True))
         return mean, variance
 
-    def posterior(self, episodes: Episodes, device: str) -> Segments:
-        """q(z | s) of whole episodes, each as one segment."""
+    def encoded(self, episodes: Episodes, device: str) -> Segments:
+        """What the encoder says of the frames of whole episodes, each as one segment."""
         frames = torch.from_numpy(np.ascontiguousarray(episodes.frames)).to(device)
         mean, variance = self.embed(frames.flatten(0, 1))
         shape = (*frames.shape[:2], -1)

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from solar_cli.inference import mniw, niw
+from solar_cli.inference import lds, mniw, niw
 from solar_cli.models.basis import LatentBasis
 from solar_cli.models.transition import TransitionNetwork
 from solar_cli.settings import TaskSettings
@@ -21,8 +21,9 @@ from solar_cli.settings.local import Dynamics
 
 
 class Segments(NamedTuple):
-    """Posterior factors q(z | s) of segments of consecutive frames, float64.
+    """Gaussians of the latents of segments of consecutive frames, float64 but in a minibatch.
 
+    What the encoder says of each frame; or a posterior q(z), whose frames may depend on each other.
     All segments have L frames of an episode's T + 1. Where they are shorter than an episode, their
     starts are taken as drawn uniformly: what such segments reach less often counts for more.
     """
@@ -38,6 +39,14 @@ class Segments(NamedTuple):
     """starts that a segment of each one's episode can have; None for a whole episode's T + 2 - L"""
     noise: Float[Tensor, "S L d"] | None = None
     """standard normal draws of a sample of each factor; None where none is drawn"""
+    smoothed: lds.Smoothed | None = None
+    """of a posterior whose frames depend on each other: all of its moments, hidden latents too"""
+    kl: Float[Tensor, " S"] | None = None
+    """KL(q(z) || prior) of each segment, where there is ``smoothed``"""
+
+    def decoded_from(self, latents: Float[Tensor, "n d"]) -> Float[Tensor, "n d"] | None:
+        """``latents`` of this posterior for a decoder; None where they are the encoder's own."""
+        return None if self.smoothed is None else latents.float()
 
     def counted(self, part: Float[Tensor, "S n *rest"]) -> Float[Tensor, "k *rest"]:
         """Of one value a frame, or a transition to one of the last n frames: those that count."""
@@ -78,6 +87,38 @@ class LatentPrior(NamedTuple):
 class Prior(Protocol):
     """What the representation is asked to look like."""
 
+    def inferred(self, encoded: Segments) -> Segments:
+        """The posterior q(z), given what the encoder says of each frame."""
+
+    def sampled(
+        self, encoded: Segments, noise: Float[Tensor, "S L d"]
+    ) -> tuple[Float[Tensor, "S L d"], Segments]:
+        """float32 latents of every frame drawn from the posterior, and the posterior."""
+
+    def settle(self) -> None:
+        """End a training: what ``read`` and ``follow`` do is as of now, and changes no more."""
+
+    @property
+    def hidden(self) -> int:
+        """Latents that no frame shows: the last ones that are read, beside the encoder's."""
+
+    def read(self, encoded: Segments) -> Float[Tensor, "S L d"]:
+        """Latents of whole episodes as control sees them: of each frame and those before it."""
+
+    def follow(
+        self,
+        mean: Float[Tensor, "N d"],
+        variance: Float[Tensor, "N d"],
+        belief: Any,
+        actions: Float[Tensor, "N a"] | None,
+        t: int,
+    ) -> tuple[Float[Tensor, "N d"], Any]:
+        """One step of ``read`` while episodes run: latents of the newest frame, and the belief.
+
+        ``mean`` and ``variance`` are the encoder's; ``belief`` is what the step before returned and
+        ``actions`` were executed since, both None at t = 0.
+        """
+
     @property
     def transition(self) -> TransitionNetwork | None:
         """A network that predicts latents, or None for a prior without."""
@@ -117,15 +158,57 @@ class Prior(Protocol):
         """Take them up."""
 
 
-class StandardNormal:
+class MeanField:
+    """q(z) is what the encoder says, frame by frame (Eq. 5); no networks beside the encoder's."""
+
+    hidden = 0
+
+    def parameters(self) -> Iterable[nn.Parameter]:
+        """None."""
+        return ()
+
+    def judged(self, statistics: Any) -> dict[str, float]:
+        """No network to judge."""
+        return {}
+
+    def inferred(self, encoded: Segments) -> Segments:
+        """As encoded."""
+        return encoded
+
+    def sampled(
+        self, encoded: Segments, noise: Float[Tensor, "S L d"]
+    ) -> tuple[Float[Tensor, "S L d"], Segments]:
+        """Each frame on its own, in the precision of the networks."""
+        sample = encoded.mean + encoded.variance.sqrt() * noise
+        doubles = encoded._replace(
+            mean=encoded.mean.double(), variance=encoded.variance.double(), noise=noise.double()
+        )
+        return sample, doubles
+
+    def settle(self) -> None:
+        """The encoder's mean is all there is to read."""
+
+    def read(self, encoded: Segments) -> Float[Tensor, "S L d"]:
+        """The encoder's mean."""
+        return encoded.mean
+
+    def follow(
+        self,
+        mean: Float[Tensor, "N d"],
+        variance: Float[Tensor, "N d"],
+        belief: Any,
+        actions: Float[Tensor, "N a"] | None,
+        t: int,
+    ) -> tuple[Float[Tensor, "N d"], Any]:
+        """The encoder's mean; nothing is carried."""
+        return mean, None
+
+
+class StandardNormal(MeanField):
     """p(z_t) = N(0, I): the VAE ablation."""
 
     factor = None
     transition = None
-
-    def parameters(self) -> tuple[()]:
-        """No networks."""
-        return ()
 
     def statistics(self, segments: Segments) -> Segments:
         """The segments as they are."""
@@ -144,10 +227,6 @@ class StandardNormal:
 
     def given(self, episodes: Segments) -> None:
         """No dynamics."""
-
-    def judged(self, statistics: Segments) -> dict[str, float]:
-        """No network to judge."""
-        return {}
 
     def metrics(self) -> dict[str, float]:
         """No parameters."""
@@ -186,7 +265,7 @@ class DynamicsStatistics(NamedTuple):
     """frames that these terms judge: S times those of an episode"""
 
 
-class BayesianLDS:
+class BayesianLDS(MeanField):
     """MNIW factors over (F, Sigma) and the NIW factor over (mu, Sigma_0), Eq. 2 to 5.
 
     With ``factors = "shared"`` one factor explains every time step, else each has its own. Only
@@ -213,8 +292,7 @@ class BayesianLDS:
         q = mniw.MNIW(
             Psi=settings.prior_scale * (degrees + d + 1) * torch.eye(d).to(zero),
             nu=degrees,
-            # The mean copies the newest block: latents change little in one step.
-            M=torch.eye(d, p).to(zero),
+            M=self._prior_mean(d, p).to(zero),
             V=torch.eye(p).to(zero) / settings.prior_precision,
         )
         steps = () if settings.factors == "shared" else (task.horizon,)
@@ -233,9 +311,9 @@ class BayesianLDS:
         )
         self.initial = self.initial_prior
 
-    def parameters(self) -> tuple[()]:
-        """No networks."""
-        return ()
+    def _prior_mean(self, d: int, p: int) -> Float[Tensor, "d p"]:
+        """It copies the newest block: latents change little in one step."""
+        return torch.eye(d, p)
 
     def statistics(self, segments: Segments) -> DynamicsStatistics:
         """Expected sufficient statistics, such that their mean over starts is an episode's."""
@@ -341,10 +419,6 @@ class BayesianLDS:
     def given(self, episodes: Segments) -> mniw.RegressionStatistics:
         """The exact posterior over (F, Sigma) given ``episodes`` alone."""
         return self.prior.plus(self.statistics(episodes).transitions)
-
-    def judged(self, statistics: DynamicsStatistics) -> dict[str, float]:
-        """No network to judge."""
-        return {}
 
     def metrics(self) -> dict[str, float]:
         """KL(q || p) of the factors over parameters: the last terms of the ELBO, in nats."""

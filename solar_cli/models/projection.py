@@ -85,10 +85,20 @@ class Projection:
         """States of every step."""
         return self.basis.state(self._windows(episodes))
 
-    def encode(self, frames: np.ndarray[Any, Any]) -> Float[Tensor, "n d"]:
-        """Latents of single frames (n, *frame)."""
-        chunks = (frames[i : i + CHUNK] for i in range(0, len(frames), CHUNK))
-        return torch.cat([self._latents(self._flat(chunk)) for chunk in chunks]).double()
+    def latents(self, episodes: Episodes) -> Float[Tensor, "N T1 d"]:
+        """Latents of every frame."""
+        every = episodes.frames.reshape(-1, *episodes.frames.shape[2:])
+        return self._encoded(every).view(*episodes.frames.shape[:2], -1)
+
+    def follow(
+        self,
+        frames: np.ndarray[Any, Any],
+        t: int,
+        belief: Any,
+        actions: Float[Tensor, "N a"] | None,
+    ) -> tuple[Float[Tensor, "N d"], Any]:
+        """Latents of the newest frames; nothing is carried."""
+        return self._encoded(frames), None
 
     def reconstruct(self, episodes: Episodes) -> np.ndarray[Any, Any]:
         """Frames as components tell them, in the shape and units of ``episodes.frames``."""
@@ -121,6 +131,11 @@ class Projection:
         flat = torch.from_numpy(np.ascontiguousarray(frames)).to(self.device).float()
         return flat.view(-1, size) / 255.0 if self._image else flat.view(-1, size)
 
+    def _encoded(self, frames: np.ndarray[Any, Any]) -> Float[Tensor, "n d"]:
+        """Latents of single frames (n, *frame)."""
+        chunks = (frames[i : i + CHUNK] for i in range(0, len(frames), CHUNK))
+        return torch.cat([self._latents(self._flat(chunk)) for chunk in chunks]).double()
+
     def _latents(self, flat: Float[Tensor, "n P"]) -> Float[Tensor, "n d"]:
         return (flat - self._centre) @ self._components
 
@@ -128,9 +143,7 @@ class Projection:
         return self._centre + latents @ self._components.T
 
     def _windows(self, episodes: Episodes) -> Float[Tensor, "N T1 W d"]:
-        every = episodes.frames.reshape(-1, *episodes.frames.shape[2:])
-        latents = self.encode(every).view(*episodes.frames.shape[:2], -1)
-        return windows_of(latents, self.task.observation.window)
+        return windows_of(self.latents(episodes), self.task.observation.window)
 
     def _basis_of(self, episodes: Episodes) -> LatentBasis:
         """Whitening of entries that have been standardised: their units are their own."""

@@ -103,7 +103,7 @@ class Representation:
         """
         factor = self._model.prior.factor if as_it_stands else None
         if older and not as_it_stands:
-            factor = self._model.prior.given(self._posterior(older))
+            factor = self._model.prior.given(self._encoded(older))
         if factor is not None:
             factor = mniw.RegressionStatistics(*(part.cpu() for part in factor))
         basis = LatentBasis(*(part.cpu() for part in self.basis))
@@ -112,8 +112,8 @@ class Representation:
 
     @property
     def latent(self) -> int:
-        """d: latents of one frame."""
-        return self.settings.representation.latent
+        """d: latents of one time step."""
+        return self.settings.representation.latent + self._model.prior.hidden
 
     @property
     def state_size(self) -> int:
@@ -145,9 +145,10 @@ class Representation:
             name = f"attempt {attempt}"
             self._latents.clear()
             terms = self._trainer.fit(name, self._model, [learned], training.steps)
-            segments = self._posterior(batches).of(slice(-kept))
-            self._model.prior.conclude(segments)
-            self._basis = self._whitening(segments)
+            encoded = self._encoded(batches).of(slice(-kept))
+            self._model.prior.conclude(encoded)
+            self._model.prior.settle()
+            self._basis = self._whitening(encoded)
             metrics = self._judge([held_out])
             metrics["held_out_cost_r2"] = self._cost_score(self, batches)
             alive = self._alive(metrics) and metrics["held_out_cost_r2"] >= LEAST_COST_R2
@@ -192,11 +193,12 @@ class Representation:
             self._take_up(before.parameters)
             self._conclude(recent)
         else:
+            self._model.prior.settle()
             self.moved_in = iteration
         return {**terms, **before.metrics, "fine_tuning_taken_back": float(kills)}
 
     def _conclude(self, batches: list[Episodes]) -> None:
-        self._model.prior.conclude(self._posterior(batches))
+        self._model.prior.conclude(self._encoded(batches))
 
     @staticmethod
     def _alive(metrics: dict[str, float]) -> bool:
@@ -208,7 +210,7 @@ class Representation:
     def _judge(self, batches: list[Episodes]) -> dict[str, float]:
         """What there is to watch, on collected episodes that the model has not been trained on."""
         model = self._model
-        segments = self._posterior(batches)
+        segments = model.prior.inferred(self._encoded(batches))
         mean, variance = segments.counted(segments.mean), segments.counted(segments.variance)
         some = slice(None, None, -(-len(mean) // JUDGED_FRAMES))
         frames = torch.cat([self._live_frames(episodes) for episodes in batches])
@@ -222,7 +224,8 @@ class Representation:
         segments = segments._replace(noise=torch.from_numpy(noise).to(mean))
         statistics = model.prior.statistics(segments)
         kl = model.prior.kl(statistics)
-        explained = explained_variance(model.networks.reconstruct(scaled), scaled)
+        expected = model.networks.reconstruct(scaled, segments.decoded_from(mean[some]))
+        explained = explained_variance(expected, scaled)
         spread = mean.var(dim=0)
         carried = spread / (spread + variance.mean(dim=0))
         return {
@@ -235,14 +238,33 @@ class Representation:
 
     @torch.no_grad()
     def embed(self, episodes: Episodes) -> Float[Tensor, "N T1 z"]:
-        """States of every step, by the encoder's mean; each frame is encoded once."""
-        return self.basis.state(self._windows(self._posterior([episodes]).mean))
+        """States of every step; each frame is encoded once."""
+        return self.basis.state(self._windows(self.latents(episodes)))
 
     @torch.no_grad()
-    def encode(self, frames: np.ndarray[Any, Any]) -> Float[Tensor, "n d"]:
-        """Latents of single frames (n, *frame), by the encoder's mean."""
+    def latents(self, episodes: Episodes) -> Float[Tensor, "N T1 d"]:
+        """Latents of every frame, from which states are made."""
+        return self._model.prior.read(self._encoded([episodes]))
+
+    @torch.no_grad()
+    def follow(
+        self,
+        frames: np.ndarray[Any, Any],
+        t: int,
+        belief: Any,
+        actions: Float[Tensor, "N a"] | None,
+    ) -> tuple[Float[Tensor, "N d"], Any]:
+        """Latents of the frames (N, *frame) of step ``t``, as ``latents`` gives them of all.
+
+        The belief is what the step before returned, ``actions`` what was wanted then; both are None
+        at the start.
+        """
         tensor = torch.from_numpy(np.ascontiguousarray(frames)).to(self.device)
-        return self._model.embed(tensor)[0]
+        mean, variance = self._model.embed(tensor)
+        if actions is not None:
+            bound = self.task.action.bound
+            actions = actions.clamp(-bound, bound).to(self.device)  # as executed
+        return self._model.prior.follow(mean, variance, belief, actions, t)
 
     @torch.no_grad()
     def reconstruct(self, episodes: Episodes) -> np.ndarray[Any, Any]:
@@ -250,7 +272,9 @@ class Representation:
         networks = self._model.networks
         seen = torch.from_numpy(np.ascontiguousarray(episodes.frames))
         scaled = networks.scaled(seen.flatten(0, 1).to(self.device))
-        frames = networks.as_frames(networks.reconstruct(scaled))
+        segments = self._model.prior.inferred(self._encoded([episodes]))
+        latents = segments.decoded_from(segments.mean.flatten(0, 1))
+        frames = networks.as_frames(networks.reconstruct(scaled, latents))
         return frames.cpu().numpy().reshape(episodes.frames.shape)
 
     def state_dict(self) -> dict[str, Any]:
@@ -280,15 +304,15 @@ class Representation:
             prior = self._make_prior()
         return LatentModel(networks.to(self.device), prior, self.settings.training.standard_normal)
 
-    def _posterior(self, batches: list[Episodes]) -> Segments:
-        """q(z | s) of whole episodes; the same networks encode no collected frame twice."""
-        return Segments.joined([self._posterior_of(episodes) for episodes in batches])
+    def _encoded(self, batches: list[Episodes]) -> Segments:
+        """Whole episodes as encoded; the same networks encode no collected frame twice."""
+        return Segments.joined([self._encoded_by_batch(episodes) for episodes in batches])
 
-    def _posterior_of(self, episodes: Episodes) -> Segments:
+    def _encoded_by_batch(self, episodes: Episodes) -> Segments:
         if episodes.batch is None:
-            return self._model.posterior(episodes, self.device)
+            return self._model.encoded(episodes, self.device)
         if episodes.batch not in self._latents:
-            self._latents[episodes.batch] = self._model.posterior(episodes, self.device)
+            self._latents[episodes.batch] = self._model.encoded(episodes, self.device)
         return self._latents[episodes.batch]
 
     def _live_frames(self, episodes: Episodes) -> Float[Tensor, "n *frame"]:
@@ -297,11 +321,11 @@ class Representation:
     def _windows(self, latents: Float[Tensor, "N T1 d"]) -> Float[Tensor, "N T1 W d"]:
         return windows_of(latents, self.task.observation.window)
 
-    def _whitening(self, segments: Segments) -> LatentBasis:
-        windows = segments.counted(self._windows(segments.mean))
+    def _whitening(self, encoded: Segments) -> LatentBasis:
+        windows = encoded.counted(self._windows(self._model.prior.read(encoded)))
         if not self.settings.whitening:
             return LatentBasis.plain(windows)
-        return LatentBasis.whitening(windows)
+        return LatentBasis.whitening(windows, self._model.prior.hidden)
 
     def _parameters(self) -> dict[str, Any]:
         networks = {

@@ -28,6 +28,10 @@ class StateRepresentation(Protocol):
         """From windows of latents to states; fixed after the first update."""
 
     @property
+    def latent(self) -> int:
+        """d: latents of one time step."""
+
+    @property
     def state_size(self) -> int:
         """z: entries of a state."""
 
@@ -40,8 +44,21 @@ class StateRepresentation(Protocol):
     def embed(self, episodes: Episodes) -> Float[Tensor, "N T1 z"]:
         """States of every step."""
 
-    def encode(self, frames: np.ndarray[Any, Any]) -> Float[Tensor, "n d"]:
-        """Latents of single frames (n, *frame)."""
+    def latents(self, episodes: Episodes) -> Float[Tensor, "N T1 d"]:
+        """Latents of every frame, from which states are made."""
+
+    def follow(
+        self,
+        frames: np.ndarray[Any, Any],
+        t: int,
+        belief: Any,
+        actions: Float[Tensor, "N a"] | None,
+    ) -> tuple[Float[Tensor, "N d"], Any]:
+        """Latents of the frames (N, *frame) of step ``t``, as ``latents`` gives them of all.
+
+        The belief is what the step before returned, ``actions`` what was wanted then; both are None
+        at the start.
+        """
 
     def reconstruct(self, episodes: Episodes) -> np.ndarray[Any, Any]:
         """Frames as latents tell them, in the shape and units of ``episodes.frames``."""

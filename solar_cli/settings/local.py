@@ -65,6 +65,19 @@ class Representation(Settings):
 class Dynamics(Settings):
     """The Bayesian linear dynamical system over latents (Eq. 2-5)."""
 
+    posterior: Literal["mean-field", "smoother"] = setting(
+        "mean-field",
+        "q(z): a factor a frame (Eq. 5), or what a smoother infers from single frames by the "
+        "dynamics; control then sees the means of its filter",
+        "Eq. 5; the authors' release smooths",
+        added="mean-field",
+    )
+    hidden: int = setting(
+        0,
+        "smoother: further latents that no single frame shows, velocities; the release has none",
+        ge=0,
+        added=0,
+    )
     factors: Literal["shared", "varying"] = setting(
         "shared", "one q(F, Sigma) for all time steps, or one a time step as in Eq. 5"
     )
@@ -77,6 +90,12 @@ class Dynamics(Settings):
     closed_form: bool = setting(
         True, "end a training with the exact posterior: a step of rate 1 on the whole data"
     )
+
+    @model_validator(mode="after")
+    def _hidden_is_inferred(self) -> Self:
+        if self.hidden and self.posterior != "smoother":
+            raise ValueError("hidden: only posterior = 'smoother' infers what no frame shows")
+        return self
 
 
 class Transition(Settings):
@@ -216,7 +235,7 @@ class StateMethod(Settings):
     )
 
     def latents(self, observation: Observation) -> int:
-        """d: entries that a state has of one frame."""
+        """d: latents that one frame shows."""
         raise NotImplementedError
 
 

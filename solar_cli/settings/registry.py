@@ -56,6 +56,12 @@ BUILT_IN = (
         source="Algorithm 1",
         settings="solar_cli.settings.local:Solar",
         learner="solar_cli.methods.solar:Solar",
+        deviations="With dynamics.posterior = 'smoother' it is the authors' release but for these: "
+        "hidden latents, which no frame shows, since an encoder that may say something of every "
+        "latent makes all of them positions; segments of episodes, N(0, I) being the prior of a "
+        "first state in the middle of one; local dynamics and costs of filtered means, on which "
+        "the policy acts, in place of EM over smoothed ones; and the filter keeps the dynamics of "
+        "the last training, so that a policy stays the same one.",
     ),
     MethodEntry(
         name="vae",

@@ -190,7 +190,7 @@ def complete(line: str) -> str:
     [
         ("solar run --task na", {"nav", "nav-fixed"}),
         ("solar run --task nav --method so", {"solar"}),
-        ("solar status --variant sm", {"smoke"}),
+        ("solar status --variant sm", {"smoke", "smoother"}),
         ("solar tasks nav-", {"nav-fixed"}),
     ],
 )

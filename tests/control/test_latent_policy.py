@@ -24,10 +24,12 @@ class Embedding:
             torch.as_tensor(rng.normal(size=(size, size))), torch.as_tensor(rng.normal(size=size))
         )
         self.encoded: list[np.ndarray] = []
+        self.carried: list[tuple] = []
 
-    def encode(self, frames):
+    def follow(self, frames, t, belief, actions):
         self.encoded.append(frames.copy())
-        return torch.from_numpy(frames[:, :d].astype(np.float64))
+        self.carried.append((t, belief, actions))
+        return torch.from_numpy(frames[:, :d].astype(np.float64)), t
 
 
 def gains(window=W, seed=1) -> LinearGaussianPolicy:
@@ -146,6 +148,19 @@ def test_only_the_newest_frame_is_encoded_at_each_step():
     assert len(embedding.encoded) == T
     for t, encoded in enumerate(embedding.encoded):
         np.testing.assert_array_equal(encoded, seen[:, t])
+
+
+def test_an_embedding_is_handed_its_belief_and_what_was_done_since():
+    embedding = Embedding()
+    policy = LatentPolicy(gains(), embedding, W, 0.0)
+    actions, _ = run(policy, frames(), np.random.default_rng(0))
+    for t, (step, belief, done) in enumerate(embedding.carried):
+        assert step == t
+        assert belief == (t - 1 if t else None)  # it returns the time step
+        if t:
+            np.testing.assert_array_equal(done, actions[:, t - 1])
+        else:
+            assert done is None
 
 
 def test_an_untrained_embedding_is_never_asked():

@@ -344,6 +344,7 @@ def test_a_trained_method_shows_what_it_sees(tmp_path, name):
     assert found.shape == episodes.frames[:2].shape
     assert found.dtype == np.uint8
     latents = run.learner.encode(episodes[:2])
-    one = run.learner.representation.encode(episodes.frames[1, 3][None])[0].numpy()
+    seen, _ = run.learner.representation.follow(episodes.frames[1, 3][None], 3, None, None)
+    one = seen[0].numpy()
     assert latents.shape == (2, 7, 4)
     np.testing.assert_allclose(latents[1, 3], one, atol=1e-5)

@@ -10,6 +10,7 @@ from solar_cli.errors import SolarError
 FINE_TUNING = ("training.fine_tune_steps=8", "training.fine_tune_rate=0.003")
 FLOORS = ("update.early_updates=1", "update.std_floor=[0.95, 0.3]", "update.kl_step=5.0")
 """The number of updates so far shows in the policy's std."""
+SMOOTHER = ('dynamics.posterior="smoother"', "dynamics.hidden=2")
 
 
 @pytest.mark.parametrize(
@@ -18,6 +19,8 @@ FLOORS = ("update.early_updates=1", "update.std_floor=[0.95, 0.3]", "update.kl_s
         ("solar", FINE_TUNING, 3 + 2 + 2),
         ("solar", ("training.attempts=2", *FLOORS), 2 * 3),
         ("solar", ('dynamics.factors="varying"', 'dynamics.rows="all"'), 3),
+        ("solar", (*FINE_TUNING, *SMOOTHER), 3 + 2 + 2),
+        ("solar", (*SMOOTHER, 'dynamics.factors="varying"'), 3),
         ("vae", FINE_TUNING, 3 + 2 + 2),
         ("rce", FINE_TUNING, 3 + 2 + 2),
         ("rce", ("training.attempts=2",), 2 * 3),
@@ -26,6 +29,8 @@ FLOORS = ("update.early_updates=1", "update.std_floor=[0.95, 0.3]", "update.kl_s
         "solar fine-tuned",
         "solar frozen, two attempts",
         "solar as in Eq. 5",
+        "smoother fine-tuned",
+        "smoother, varying",
         "vae fine-tuned",
         "rce fine-tuned",
         "rce frozen, two attempts",

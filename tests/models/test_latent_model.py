@@ -36,7 +36,7 @@ def minibatch(seed=1, segments=3, length=4, decoded=(0, 3, 5, 11)) -> Minibatch:
 
 
 def taught(model: LatentModel) -> LatentModel:
-    model.prior.conclude(model.posterior(vector_episodes(TASK, 6), "cpu"))
+    model.prior.conclude(model.encoded(vector_episodes(TASK, 6), "cpu"))
     return model
 
 
@@ -137,7 +137,7 @@ def test_embedding_in_chunks_is_embedding(monkeypatch):
 
 def test_the_posterior_of_episodes_is_frame_by_frame():
     model, episodes = tiny(), vector_episodes(TASK, 4)
-    found = model.posterior(episodes, "cpu")
+    found = model.encoded(episodes, "cpu")
     assert found.mean.shape == found.variance.shape == (4, 6, D)
     assert found.start.tolist() == [0] * 4
     assert torch.equal(found.actions, torch.from_numpy(episodes.actions))

@@ -61,7 +61,9 @@ def flat(episodes: Episodes) -> np.ndarray:
 
 def test_latents_of_observed_states_are_those_states():
     model = make()
-    assert torch.equal(model.encode(FIRST.frames[:, 2]).float(), torch.tensor(FIRST.frames[:, 2]))
+    assert torch.equal(model.latents(FIRST).float(), torch.tensor(FIRST.frames))
+    latest, _ = model.follow(FIRST.frames[:, 2], 2, None, None)
+    assert torch.equal(latest.float(), torch.tensor(FIRST.frames[:, 2]))
     model.update(Collected(FIRST))
     np.testing.assert_array_equal(model.reconstruct(FIRST), FIRST.frames)
     # Nothing is lost on the way to states either.
@@ -165,7 +167,7 @@ def test_a_state_of_images_has_their_components_for_each_frame_of_the_window(win
     model.update(Collected(episodes))
     assert model.state_size == 3 * window
     assert model.embed(episodes).shape == (14, 8, 3 * window)
-    assert model.encode(episodes.frames[:5, 0]).shape == (5, 3)
+    assert model.latents(episodes).shape == (14, 8, 3)
 
 
 def test_an_image_has_no_more_components_than_pixels():

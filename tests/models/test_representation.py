@@ -15,6 +15,7 @@ from solar_cli.errors import UsageError
 from solar_cli.models import representation, training
 from solar_cli.models.priors import BayesianLDS
 from solar_cli.models.representation import Representation
+from solar_cli.models.smoothing import linear_dynamics
 from solar_cli.settings.local import Solar
 from solar_cli.streams import Streams
 
@@ -59,20 +60,26 @@ def short_and_easily_pleased(monkeypatch):
     monkeypatch.setattr(representation, "ACTIVE_SHARE", 0.0)
 
 
-def make(score=None, pulse=lambda *_: None, seed=0, task=TASK, **changes) -> Representation:
+SMOOTHER = {"posterior": "smoother", "hidden": 1}
+
+
+def make(
+    score=None, pulse=lambda *_: None, seed=0, task=TASK, dynamics=(), **changes
+) -> Representation:
     layers = ({"kind": "linear", "width": 6},)
     settings = Solar.model_validate(
         {
             "batches": {"initial": 14, "noisy": 6},
             "budget": {"desk": 1, "full": 1},
             "representation": {"latent": 2, "encoder": layers, "decoder": layers},
+            "dynamics": dict(dynamics),
             "training": {"steps": 4, "segments": 3, "length": 4, **changes},
         }
     )
     return Representation(
         settings,
         task,
-        lambda: BayesianLDS(settings.dynamics, 2, task, "cpu"),
+        lambda: linear_dynamics(settings.dynamics, 2, task, "cpu"),
         Scores(1.0) if score is None else score,
         Streams(seed),
         "cpu",
@@ -181,13 +188,13 @@ def test_an_active_latent_is_one_whose_mean_carries_its_variance(monkeypatch):
     model = make()
     model.update(Collected(FIRST))
     monkeypatch.setattr(representation, "ACTIVE_SHARE", 0.9)
-    segments = model._model.posterior(FIRST, "cpu")
+    segments = model._model.encoded(FIRST, "cpu")
     # One latent varies as its variance is, so its mean carries half; the other hardly has any.
     spread = segments.mean.flatten(0, 1).var(dim=0)
     variance = torch.stack([spread[0], 0.01 * spread[1]])
     monkeypatch.setattr(
         model._model,
-        "posterior",
+        "encoded",
         lambda *_: segments._replace(variance=variance.expand_as(segments.variance)),
     )
     assert model._judge([FIRST])["active_latents"] == 1.0
@@ -296,7 +303,7 @@ def test_a_checkpoint_can_be_made_again_before_anything_goes_on(fine_tune_steps)
 def conditioned(model: Representation, *batches: Episodes) -> list[torch.Tensor]:
     """The factor of a fresh prior after the closed form on these batches."""
     closed = BayesianLDS(model.settings.dynamics, 2, TASK, "cpu")
-    closed.conclude(model._model.posterior(Episodes.joined(list(batches)), "cpu"))
+    closed.conclude(model._model.encoded(Episodes.joined(list(batches)), "cpu"))
     return list(closed.factor)
 
 
@@ -323,9 +330,9 @@ def test_the_same_networks_encode_no_collected_frame_twice(monkeypatch, fine_tun
             unknown = replace(known, batch=None)
             assert torch.equal(model.embed(known), model.embed(unknown))
     encoded: list[int] = []
-    posterior = model._model.posterior
+    encoded_by = model._model.encoded
     monkeypatch.setattr(
-        model._model, "posterior", lambda e, device: encoded.append(len(e)) or posterior(e, device)
+        model._model, "encoded", lambda e, device: encoded.append(len(e)) or encoded_by(e, device)
     )
     for known in named:
         model.embed(known)
@@ -452,7 +459,7 @@ def test_states_are_the_basis_of_windows_of_single_frames():
     states = model.embed(FIRST)
     assert states.shape == (14, 8, 4)
     assert states.dtype == torch.float64
-    latents = torch.stack([model.encode(FIRST.frames[:, t]) for t in range(8)], dim=1)
+    latents = torch.stack([model.follow(FIRST.frames[:, t], t, None, None)[0] for t in range(8)], 1)
     for t, frames in enumerate(window_indices(7, 2)):
         newest_first = [latents[:, frame] for frame in reversed(frames)]
         expected = torch.cat(newest_first, dim=1) @ model.basis.A.T + model.basis.b
@@ -466,6 +473,66 @@ def test_states_are_white_on_what_was_learned_from():
     z = model.embed(FIRST[:-2])[..., :2].flatten(0, 1).numpy()
     np.testing.assert_allclose(z.mean(axis=0), 0, atol=1e-8)
     np.testing.assert_allclose(np.cov(z.T), np.eye(2), atol=1e-8)
+
+
+@pytest.mark.parametrize("fine_tune_steps", [0, 4])
+def test_a_smoothers_states_are_followed_with_the_actions_that_were_executed(fine_tune_steps):
+    """Also after its factors have learned more; an action beyond the bound was clipped."""
+    task = vector_task(horizon=7)
+    made_of = [vector_episodes(task, 14), vector_episodes(task, 6, seed=7)]
+    model = make(task=task, dynamics=SMOOTHER, fine_tune_steps=fine_tune_steps)
+    for iteration in (1, 2):
+        model.update(Collected(*made_of[:iteration]))
+        wanted = np.random.default_rng(0).normal(0, 2.0, (6, 7, 2))
+        episodes = replace(made_of[1], actions=np.clip(wanted, -1.0, 1.0))
+        assert (wanted != episodes.actions).any()
+        states, belief, actions = model.embed(episodes), None, None
+        assert states.shape == (6, 8, 2 + 1) == (6, 8, model.state_size)
+        for t in range(8):
+            latents, belief = model.follow(episodes.frames[:, t], t, belief, actions)
+            state = model.basis.state(latents[:, None])
+            torch.testing.assert_close(state, states[:, t], rtol=1e-4, atol=1e-4)
+            actions = torch.from_numpy(wanted[:, t]) if t < 7 else None
+
+
+def test_a_frozen_smoothers_states_stay_what_they_are():
+    task = vector_task(horizon=7)
+    first, second = vector_episodes(task, 14), vector_episodes(task, 6, seed=7)
+    model = make(task=task, dynamics=SMOOTHER)
+    model.update(Collected(first))
+    states, factor = model.embed(second), own_factor(model)
+    model.update(Collected(first, second))
+    assert model.moved_in == 1
+    assert torch.equal(model.embed(second), states)
+    assert digest(own_factor(model)) != digest(factor)
+
+
+def test_hidden_latents_stay_the_last_entries_of_a_state():
+    """Frames tell of the others alone: costs are fitted to them, and white they are apart."""
+    task = vector_task(horizon=7)
+    episodes = vector_episodes(task, 14)
+    model = make(task=task, dynamics=SMOOTHER, held_out=0.01)
+    model.update(Collected(episodes))
+    latents, states = (part(episodes)[:-1].flatten(0, 1) for part in (model.latents, model.embed))
+    assert not model.basis.A[:2, 2:].any()
+    assert not model.basis.A[2:, :2].any()
+    np.testing.assert_allclose(np.cov(states[:, :2].T), np.eye(2), atol=1e-8)
+    assert float(states[:, 2].var()) == pytest.approx(1.0)
+    torch.testing.assert_close(latents @ model.basis.A.T + model.basis.b, states)
+
+
+def test_a_smoother_reconstructs_from_what_all_frames_tell():
+    task = vector_task(horizon=7)
+    episodes = vector_episodes(task, 14)
+    model = make(task=task, dynamics=SMOOTHER)
+    model.update(Collected(episodes))
+    posterior = model._model.prior.inferred(model._model.encoded(episodes, "cpu"))
+    networks = model._model.networks
+    scaled = networks.scaled(torch.from_numpy(episodes.frames).flatten(0, 1))
+    expected = networks.decoder(posterior.mean.flatten(0, 1).float())
+    found = networks.scaled(torch.from_numpy(model.reconstruct(episodes)).flatten(0, 1))
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
+    assert not torch.allclose(found, networks.reconstruct(scaled), atol=1e-3)
 
 
 def test_reconstructions_have_the_shape_and_units_of_frames():

@@ -259,7 +259,7 @@ def test_the_scale_makes_a_minibatch_as_large_as_the_data(window):
         found = model.loss(batch, 1.0)[1]
         transitions += data.scale(batch) * float(found.transitions.n) / firsts
         starts += data.scale(batch) * float(found.starts.n) / firsts
-    whole = model.prior.statistics(model.posterior(data.episodes, "cpu"))
+    whole = model.prior.statistics(model.encoded(data.episodes, "cpu"))
     assert starts == pytest.approx(float(whole.starts.n)) == 6
     assert transitions == pytest.approx(float(whole.transitions.n)) == 6 * (9 - window)
 
