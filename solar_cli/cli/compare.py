@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from solar_cli.cli.options import AsJson, Database, Force, Output, complete_method
+from solar_cli.cli.options import AsJson, Database, Force, Output, Tasks, complete_method
 from solar_cli.cli.printing import deliver, print_table, say
 
 
@@ -35,6 +35,7 @@ def command(
             metavar="M2[:VARIANT]", help="Another; else solar.", autocompletion=complete_method
         ),
     ] = None,
+    task: Tasks = None,
     format: Annotated[Format, typer.Option("--format", help="How to write it.")] = Format.TABLE,
     json: AsJson = False,
     output: Output = None,
@@ -45,13 +46,15 @@ def command(
 
     \b
     Example:
-      solar compare vae solar --format markdown
+      solar compare ppo solar --task nav --format markdown
     """
+    from solar_cli.cli.selection import require_known
     from solar_cli.reporting.compare import compare
     from solar_cli.store.store import Store
 
     with Store.open(db, read_only=True) as store:
-        comparison = compare(store, left, right)
+        require_known(store, task, None, None)
+        comparison = compare(store, left, right, task or ())
     chosen = Format.JSON if json else format
     if chosen is Format.TABLE and output is not None:
         chosen = Format.MARKDOWN

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -116,8 +117,15 @@ class Comparison:
         return json.dumps(_plain([asdict(pair) for pair in self.pairs]), indent=2, allow_nan=False)
 
 
-def compare(store: Store, left: str | None = None, right: str | None = None) -> Comparison:
+def compare(
+    store: Store,
+    left: str | None = None,
+    right: str | None = None,
+    tasks: Collection[str] = (),
+) -> Comparison:
     """Compare two methods, given as ``METHOD`` or ``METHOD:VARIANT``, on every problem of both.
+
+    Where ``tasks`` are named, on theirs alone.
 
     Without ``right`` it is ``solar``; without both, every method and variant is compared with
     ``solar`` on every problem. Raises `UsageError` for a name the store has no curve of, and
@@ -129,7 +137,8 @@ def compare(store: Store, left: str | None = None, right: str | None = None) -> 
         said = [*more, *notes(store, one, present), *notes(store, other, present)]
         return compare_curves(problem, one, other, said)
 
-    found = problems(store)
+    every = problems(store)
+    found = [problem for problem in every if not tasks or problem.task in tasks]
     if left is None:
         pairs = [
             pair(problem, curve, baseline, *stands_in(baseline))
@@ -139,7 +148,7 @@ def compare(store: Store, left: str | None = None, right: str | None = None) -> 
             if curve is not baseline
         ]
     else:
-        names = [_known(found, left), _known(found, right or BASELINE)]
+        names = [_known(every, left), _known(every, right or BASELINE)]
         if names[0] == names[1]:
             raise UsageError(f"{left!r} and {right or BASELINE!r} are the same: name two")
         pairs = [
@@ -149,8 +158,9 @@ def compare(store: Store, left: str | None = None, right: str | None = None) -> 
         ]
     if not pairs:
         both = "two methods" if left is None else f"both {left!r} and {right or BASELINE!r}"
+        where = f"no problem of task {' or '.join(map(repr, tasks))}" if tasks else "no problem"
         raise SolarError(
-            f"nothing to compare in {store}: no problem has curves of {both}; "
+            f"nothing to compare in {store}: {where} has curves of {both}; "
             "`solar run --task nav --method solar --method vae --seeds 5` makes some"
         )
     return Comparison(tuple(pairs))

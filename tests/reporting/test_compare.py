@@ -8,6 +8,7 @@ from hand_made import cell, compute, database, flat_curve, problem
 
 from solar_cli.errors import SolarError, UsageError
 from solar_cli.reporting.compare import compare, compare_curves, judge
+from solar_cli.settings import cells, load_card
 from solar_cli.store.records import Outcome
 
 NEAR = [0.10, 0.11, 0.12, 0.13]
@@ -110,6 +111,22 @@ def test_a_single_seed_has_no_std_in_json(tmp_path):
             compute(store, cell("vae", seed), [1.0, 0.2])
         (entry,) = json.loads(compare(store).to_json(), parse_constant=pytest.fail)
     assert (entry["left"]["std"], entry["right"]["std"]) == (0.0, None)
+
+
+def test_named_tasks_alone_are_compared(tmp_path):
+    def of(task, method):
+        return cells(load_card(task), method, [0])[0]
+
+    with database(tmp_path) as store:
+        for method in ("solar", "vae"):
+            compute(store, cell(method), [1.0, 0.1])
+            compute(store, of("nav-fixed", method), [1.0, 0.1])
+        compute(store, of("car", "solar"), [4.0, 0.1])
+        assert [pair.problem for pair in compare(store).pairs] == ["nav", "nav-fixed"]
+        for tasks, left in ((["nav"], "vae"), (["nav", "car"], None)):
+            assert [pair.problem for pair in compare(store, left, tasks=tasks).pairs] == ["nav"]
+        with pytest.raises(SolarError, match="no problem of task 'car' has curves of both 'vae'"):
+            compare(store, "vae", tasks=["car"])
 
 
 def test_names_that_nothing_is_stored_of_are_refused_with_the_nearest(tmp_path):
