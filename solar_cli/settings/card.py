@@ -182,8 +182,11 @@ def resolve(
             f"variant {variant!r} of task {card.name!r} changes nothing for {method_name!r}: "
             "leave --variant out"
         )
-    layers = [("card", _with_method(card, method_name))]
-    layers += [(f"variant {variant}", _variant(card, variant))]
+    overrides = _variant(card, variant)
+    layers = [
+        ("card", _with_method(card, card.tables, method_name)),
+        (f"variant {variant}", _with_method(card, overrides, method_name, f"variants.{variant}.")),
+    ]
     layers += [("--set", assignment(text)) for text in sets]
     merged: Table = {"method": _own_defaults(settings_class(entry))}
     origins: dict[str, str] = {}
@@ -235,19 +238,24 @@ def _changes(card: Card, variant: str, method_name: str) -> bool:
     return variant == "default" or bool(shared) or method_name in overrides.get("methods", {})
 
 
-def _with_method(card: Card, method_name: str) -> Table:
-    """The card's tables, a method that is ``like`` another one with the other's below its own."""
-    methods: Table = card.tables.get("methods", {})
+def _with_method(card: Card, layer: Table, method_name: str, place: str = "") -> Table:
+    """The card's tables or a variant's; below a method's own what it is ``like`` another one's.
+
+    It takes of the other what it has a setting for.
+    """
+    methods: Table = layer.get("methods", {})
     own = deepcopy(methods.get(method_name, {}))
     like = own.pop("like", None)
     if like is not None and (not isinstance(like, str) or like not in methods):
         raise UsageError(
-            f"card {card.path}: methods.{method_name}.like = {like!r}: "
+            f"card {card.path}: {place}methods.{method_name}.like = {like!r}: "
             f"{nearest(str(like), set(methods) - {method_name})}"
         )
-    table = deepcopy(methods[like]) if like else {}
+    others = methods[like] if like else {}
+    taken = settings_class(method(method_name)).model_fields.keys() & others.keys()
+    table = {key: deepcopy(others[key]) for key in others if key in taken}
     _merge(table, own)
-    return {**card.tables, "methods": {**methods, method_name: table}}
+    return {**layer, "methods": {**methods, method_name: table}}
 
 
 def _variant(card: Card, variant: str) -> Table:

@@ -68,6 +68,19 @@ def test_a_method_can_be_like_another_one(tmp_path: Path) -> None:
     assert vae.local_fit.method == "gmm"  # its own default stands
     path = toy(tmp_path, '[methods.vae]\nlike = "slar"')
     check(lambda: load_card(str(path)), ["methods.vae.like", "solar"])
+    like = '[methods.vae]\nlike = "solar"\n[variants.long.methods.vae]\nlike = "slar"'
+    path = toy(tmp_path, like)
+    check(lambda: load_card(str(path)), ["variants.long.methods.vae.like", "slar"])
+
+
+def test_a_method_like_another_takes_what_both_have_in_a_card_and_in_its_variants() -> None:
+    card = load_card("nav")
+    for variant in ("default", "smoke"):
+        solar, flm = (
+            resolve(card, name, variant).configuration.method for name in ("solar", "lqr-flm")
+        )
+        assert (flm.batches, flm.budget) == (solar.batches, solar.budget)
+        assert not hasattr(flm, "training")
 
 
 def test_later_layers_win_and_each_value_knows_where_it_comes_from(tmp_path: Path) -> None:
