@@ -60,7 +60,8 @@ class GlobalMpc(LatentLearner):
         size, network = self.representation.state_size, settings.network
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(streams.seed63("network weights"))
-            dynamics = NeuralDynamics(size, self.latent, task.action.size, network)
+            newest = self.representation.latent  # hidden ones too
+            dynamics = NeuralDynamics(size, newest, task.action.size, network)
             cost = NeuralCost(self.latent, network)
         self.model = NeuralModel(dynamics, cost).to(device)
         self.trainer = NeuralTrainer(network, streams.under("network"), pulse)
@@ -102,16 +103,12 @@ class GlobalMpc(LatentLearner):
         return {**represented, **fitted, "seconds_training": seconds}
 
     def _collect(self, experience: Experience) -> None:
-        """Line 4 of Algorithm 1, as SOLAR collects: without noise first, where the card says so."""
+        """Line 4 of Algorithm 1; where a card has episodes that judge, they explore here too."""
         batches = self.settings.batches
         noisy = batches.initial if experience.iteration == 1 else batches.noisy
-        collected = []
-        if batches.noise_free:
-            collected.append(experience.collect(self.policy, batches.noise_free, noisy=False))
-        collected.append(experience.collect(self.policy, noisy))
-        for episodes in collected:
-            if not bool(torch.isfinite(torch.from_numpy(episodes.costs)).all()):
-                raise Diverged(f"a cost of iteration {experience.iteration} is not finite")
+        episodes = experience.collect(self.policy, noisy + batches.noise_free)
+        if not bool(torch.isfinite(torch.from_numpy(episodes.costs)).all()):
+            raise Diverged(f"a cost of iteration {experience.iteration} is not finite")
 
     def _embedded(self, experience: Experience) -> list[Sequences]:
         """All batches, each embedded once by the same representation."""

@@ -24,6 +24,7 @@ from solar_cli.envs import state_cost
 from solar_cli.episodes import Experience, Policy
 from solar_cli.errors import UsageError
 from solar_cli.methods import Learner
+from solar_cli.methods.reference import Fixed
 from solar_cli.models.basis import LatentBasis
 from solar_cli.models.neural import NeuralDynamics, Sequences
 from solar_cli.models.neural_fit import NeuralModel, NeuralTrainer
@@ -51,6 +52,11 @@ class MpcNn(Learner):
             raise UsageError(
                 f"{error}; or choose global-mpc, which learns what states cost"
             ) from error
+        if task.observation.window > 1:
+            raise UsageError(
+                f"task.observation.window = {task.observation.window}: mpc-nn sees one state at a "
+                "time; set it to 1, or choose global-mpc"
+            )
         self.states = States(task.observation.width, device)
         width, network = task.observation.width, settings.network
         with torch.random.fork_rng(devices=[]):
@@ -70,7 +76,9 @@ class MpcNn(Learner):
     def iterate(self, experience: Experience) -> dict[str, float]:
         """Collect with the planner, and fit the network to all episodes so far."""
         settings, first = self.settings, experience.iteration == 1
-        experience.collect(self.policy, settings.initial if first else settings.episodes)
+        # At first of uniform actions, as those are that it will try.
+        policy = Fixed(self.task, self.streams) if first else self.policy
+        experience.collect(policy, settings.initial if first else settings.episodes)
         every = [experience.batch(name) for name in experience.batches()]
         seen = [
             Sequences.of(self.states.of(episodes.frames), episodes, self.task.action_cost)

@@ -69,7 +69,7 @@ class OnPolicyLearner(Learner, ABC):
         self.settings, self.task, self.streams, self.pulse = settings, task, streams, pulse
         with seeded(streams.under("weights")):
             self.model = self._model(device)
-        self.rollouts = 0  # learned from
+        self.rollouts = 0  # so far
         self.sums: dict[str, float] = {}  # of metrics, over the rollouts of this iteration
 
     @abstractmethod
@@ -120,16 +120,18 @@ class OnPolicyLearner(Learner, ABC):
             episodes = experience.collect(actor, self.settings.rollout, kept=False)
             if not np.isfinite(episodes.costs).all():
                 raise Diverged(f"a cost of iteration {experience.iteration} is not finite")
-            if self.rollouts == 0:
+            if self.rollouts == 0 and self.network.standardises:
+                # Another network than the one that acted: it learns from the next rollout on.
                 self.network.standardise_by(windows(episodes)[episodes.live_steps])
-            began = time.perf_counter()
-            self._learn(episodes, actor)
-            seconds = time.perf_counter() - began
-            self.sums["seconds_training"] = self.sums.get("seconds_training", 0.0) + seconds
+            else:
+                began = time.perf_counter()
+                self._learn(episodes, actor)
+                seconds = time.perf_counter() - began
+                self.sums["seconds_training"] = self.sums.get("seconds_training", 0.0) + seconds
             self.rollouts += 1
             self.pulse("learning", (self.rollouts - done) / (until - done))
         sums, self.sums = self.sums, {}
-        seconds = sums.pop("seconds_training")
+        seconds = sums.pop("seconds_training", 0.0)
         return {**{k: v / (until - done) for k, v in sums.items()}, "seconds_training": seconds}
 
     def _learn(self, episodes: Episodes, actor: Actor) -> None:

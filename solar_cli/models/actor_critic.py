@@ -110,8 +110,13 @@ class ActorCriticOfLayers(ActorCriticPolicy):
             of_value = self.mlp_extractor.forward_critic(features[1])
         return self.action_net(of_policy), self.value_net(of_value)
 
+    @property
+    def standardises(self) -> bool:
+        """Whether the card says so."""
+        return any(isinstance(part, Layers) and part.standardises for part in self.modules())
+
     def standardise_by(self, windows: NDArray[Any]) -> None:
-        """Take mean and scale from observations (n, *shape), where the card says so."""
+        """Take mean and scale from observations (n, *shape)."""
         for part in self.modules():
-            if isinstance(part, Layers) and part.standardises:
+            if isinstance(part, Layers):
                 part.standardise_by(windows)

@@ -56,7 +56,7 @@ class NeuralModel(nn.Module):
             torch.cat([states, segment.actions[:, 0]], dim=-1), change
         )
         if self.cost is not None:
-            self.cost.standardise_by(states[:, :d], segment.costs)
+            self.cost.standardise_by(states[:, : self.cost.newest], segment.costs)
         self.standardised.fill_(True)
 
     def loss(self, segment: Segment, noise: Tensor | None = None) -> Tensor:
@@ -146,6 +146,8 @@ class NeuralTrainer:
             optimiser.load_state_dict(self._running.pop("optimiser"))
         self._optimiser = optimiser
         running, last, settings = self._running, time.perf_counter(), self.settings
+        if running["step"] == 0:  # what there was before is kept where nothing beats it
+            self._judge(model, judged)
         while running["step"] < settings.steps:
             rate = settings.learning_rate
             if settings.schedule == "cosine":

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Self
+
+from pydantic import model_validator
+
 from solar_cli.settings.local import Budget
 from solar_cli.settings.networks import Conv, Layer, SpatialSoftmax, Unshuffle
 from solar_cli.settings.schema import Settings, setting
@@ -50,6 +54,12 @@ class Planner(Settings):
     std: float = setting(2.0, "of the first sequences, over that of exploration", gt=0)
     least_std: float = setting(0.1, "least std of the later ones, over that of exploration", ge=0)
     noise: float = setting(1.0, "std of noise on collected actions, over that of exploration", ge=0)
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        if self.elites > self.samples:
+            raise ValueError("elites: more than samples")
+        return self
 
 
 class PixelMpc(Settings):

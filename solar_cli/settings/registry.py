@@ -43,8 +43,9 @@ class MethodEntry:
 ON_POLICY = (
     "Ours: rollouts of whole episodes, collected side by side; the learning rate falls over the "
     "card's horizon, to a twentieth; actions in units of their bound; observations standardised by "
-    "the first rollout; costs after an early end are part of the last live step's reward. A "
-    "horizon cuts off, it does not end: the last value counts. The paper gives no settings."
+    "the first rollout, from which nothing else is learned; costs after an early end are part of "
+    "the last live step's reward. A horizon cuts off, it does not end: the last value counts. The "
+    "paper gives no settings."
 )
 """deviations that PPO and TRPO share"""
 
@@ -154,7 +155,7 @@ BUILT_IN = (
         settings="solar_cli.settings.on_policy:Trpo",
         learner="solar_cli.methods.trpo:Trpo",
         deviations=f"Networks, buffer, advantages and update are sb3-contrib's. {ON_POLICY} "
-        "The policy's step is computed on a part of the data.",
+        "For speed a step is computed on every fourth sample, by 10 conjugate gradients.",
     ),
     MethodEntry(
         name="zero",

@@ -6,7 +6,11 @@ from method_runs import Run
 
 from solar_cli.envs import build_task
 from solar_cli.episodes import evaluate
+from solar_cli.settings.registry import BUILT_IN
 from solar_cli.streams import Streams
+
+TASKS = {"mpc-nn": "car-states"}
+"""of methods that do not learn from images"""
 
 
 class Blind:
@@ -25,19 +29,28 @@ class Blind:
         raise RuntimeError("not for learners")
 
 
+FINE_TUNED = "training.fine_tune_steps=4"
+SMOOTHER = 'dynamics={ posterior = "smoother", hidden = 2 }'
+
+
 @pytest.mark.parametrize(
     ("name", "sets"),
     [
-        ("solar", ["training.fine_tune_steps=4"]),
-        ("vae", ["training.fine_tune_steps=4"]),
-        ("rce", ["training.fine_tune_steps=4"]),
+        ("solar", [FINE_TUNED]),
+        ("solar", [SMOOTHER]),
+        ("vae", [FINE_TUNED]),
+        ("rce", [FINE_TUNED]),
         ("lqr-flm", []),
+        ("global-mpc", [FINE_TUNED]),
+        ("global-mpc", [SMOOTHER]),
+        ("mpc-nn", []),
+        ("pixel-mpc", []),
     ],
 )
 def test_evaluating_never_once_or_ten_times_gives_the_same_policies(tmp_path, name, sets):
     found = set()
     for times in (0, 1, 10):
-        run = Run(tmp_path / str(times), name, *sets)
+        run = Run(tmp_path / str(times), name, *sets, task=TASKS.get(name, "nav"))
         task = run.configuration.task
         for iteration in (1, 2):
             run.iterate(iteration, iteration)
@@ -52,9 +65,10 @@ def test_evaluating_never_once_or_ten_times_gives_the_same_policies(tmp_path, na
 
 
 @pytest.mark.filterwarnings("ignore:ground truth is missing")
-@pytest.mark.parametrize("name", ["solar", "vae", "rce", "lqr-flm"])
+@pytest.mark.parametrize("name", [entry.name for entry in BUILT_IN])
 def test_measures_are_out_of_a_learners_reach(tmp_path, name):
-    seeing = Run(tmp_path / "seeing", name).iterate(1, 2)
-    blind = Run(tmp_path / "blind", name, wrap=Blind).iterate(1, 2)
+    task = TASKS.get(name, "nav")
+    seeing = Run(tmp_path / "seeing", name, task=task).iterate(1, 2)
+    blind = Run(tmp_path / "blind", name, wrap=Blind, task=task).iterate(1, 2)
     assert repr(blind.metrics) == repr(seeing.metrics)
     assert digest(blind.state()["learner"]) == digest(seeing.state()["learner"])

@@ -161,5 +161,5 @@ def test_without_a_share_all_segments_are_alike():
 def test_a_loss_that_is_no_number_ends_the_fit():
     broken = episodes()
     broken.states[:, 5] = torch.nan
-    with pytest.raises(Diverged, match="step 40 of x"):
+    with pytest.raises(Diverged, match="step 0 of x"):
         fitted(batches=[broken])
