@@ -279,7 +279,7 @@ class Environment:
         self._call = 0
 
     def resume_at(self, call: int) -> None:
-        """Go on with this call of the iteration: from the earlier ones, all is learned."""
+        """Go on with this call of the iteration: the earlier ones are learned from already."""
         self._call = call
 
     def collect(

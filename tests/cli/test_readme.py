@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 from scenario import Solar, Stored
 
+from solar_cli.settings.registry import BUILT_IN
+
 TEXT = (Path(__file__).parent.parent.parent / "README.md").read_text()
 
 
@@ -37,6 +39,18 @@ def test_a_card_is_a_card(
     done = solar("run", "--task", name, "--method", "solar", "--dry-run", "--json")
     [cell] = json.loads(done.out)
     assert (cell["task"], cell["action"], cell["target"]) == (name, "run", 240)
+
+
+def test_every_method_is_told_with_a_command(solar: Solar) -> None:
+    section = TEXT.split("## Methods")[1].split("\n## ")[0]
+    for entry in BUILT_IN:
+        assert f"`{entry.name}`" in section
+    commands = re.findall(r"`solar (run .+?)`", section)
+    named = {word for command in commands for word in command.split()}
+    assert {entry.name for entry in BUILT_IN} <= named
+    for command in commands:
+        cells = json.loads(solar(*command.split(), "--dry-run", "--json").out)
+        assert {cell["action"] for cell in cells} == {"run"}
 
 
 def test_every_parameter_of_a_gymnasium_task_is_told() -> None:
