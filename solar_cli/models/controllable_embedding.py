@@ -21,8 +21,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from solar_cli.models.networks import perceptron
 from solar_cli.models.priors import MeanField, Segments, regressors
-from solar_cli.models.transition import Local, TransitionNetwork, perceptron
+from solar_cli.models.transition import Local, TransitionNetwork, small_at_last
 from solar_cli.pulse import Diverged
 from solar_cli.settings import TaskSettings
 from solar_cli.settings.local import Transition
@@ -74,7 +75,8 @@ class ControllableEmbedding(MeanField):
             settings, latent, window, task.action.size, task.exploration.std
         ).to(device)
         # From mu, log sigma, e and z^ to where zbar is likely, beginning with p(zbar | x).
-        self.recognition = perceptron((window + 2) * latent, settings.recognition, 2 * latent, 0.0)
+        recognition = perceptron((window + 2) * latent, settings.recognition, 2 * latent)
+        self.recognition = small_at_last(recognition, 0.0)
         self.recognition.to(device)
 
     def parameters(self) -> Iterable[nn.Parameter]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float
@@ -123,6 +124,19 @@ def build(layers: Sequence[Layer], shape: Shape, frame: Shape = ()) -> tuple[nn.
         modules += added
         shape = after
     return nn.Sequential(*modules), shape
+
+
+def perceptron(
+    inputs: int,
+    hidden: Sequence[int],
+    outputs: int,
+    activation: Callable[[], nn.Module] = nn.ReLU,
+) -> nn.Sequential:
+    """Fully connected layers, with an activation after each but the last."""
+    layers: list[nn.Module] = []
+    for before, after in pairwise((inputs, *hidden)):
+        layers += [nn.Linear(before, after), activation()]
+    return nn.Sequential(*layers, nn.Linear((inputs, *hidden)[-1], outputs))
 
 
 def _weights(layer: Layer, shape: Shape) -> int:

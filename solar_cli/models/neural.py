@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from solar_cli.episodes import Episodes
 from solar_cli.models.basis import LatentBasis
+from solar_cli.models.networks import perceptron
 from solar_cli.settings.neural import NeuralFit
 
 ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {
@@ -88,15 +89,6 @@ class Segment(NamedTuple):
     costs: Float[Tensor, "n K"]
 
 
-def perceptron(inputs: int, outputs: int, settings: NeuralFit) -> nn.Sequential:
-    """Fully connected layers."""
-    layers: list[nn.Module] = []
-    for width in settings.widths:
-        layers += [nn.Linear(inputs, width), ACTIVATIONS[settings.activation]()]
-        inputs = width
-    return nn.Sequential(*layers, nn.Linear(inputs, outputs))
-
-
 class Standardised(nn.Module):
     """y = mean_y + std_y f((x - mean_x) / std_x): a network on what it was shown first."""
 
@@ -107,7 +99,8 @@ class Standardised(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, settings: NeuralFit) -> None:
         super().__init__()
-        self.body = perceptron(inputs, outputs, settings)
+        activation = ACTIVATIONS[settings.activation]
+        self.body = perceptron(inputs, settings.widths, outputs, activation)
         for name, count in (("x", inputs), ("y", outputs)):
             self.register_buffer(f"{name}_mean", torch.zeros(count))
             self.register_buffer(f"{name}_std", torch.ones(count))

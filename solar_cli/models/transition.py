@@ -9,13 +9,13 @@ Axes: n samples, d latents of a frame, W frames of a window, r = (W - 1) d diffe
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from solar_cli.models.networks import perceptron
 from solar_cli.settings.local import Transition
 
 TRACKING = 0.02  # of the latents' mean and std, a step of training: an average over about 50
@@ -95,7 +95,8 @@ class TransitionNetwork(nn.Module):
         differences = (window - 1) * latent
         self.shapes = ((latent,), (latent,), (latent, differences), (latent, actions), (latent,))
         outputs = sum(torch.Size(shape).numel() for shape in self.shapes)
-        self.layers = perceptron(latent + differences, settings.hidden, outputs, SMALL)
+        layers = perceptron(latent + differences, settings.hidden, outputs)
+        self.layers = small_at_last(layers, SMALL)
         for name, value in {
             "mean": torch.zeros(latent, dtype=torch.float64),
             "std": torch.ones(latent, dtype=torch.float64),
@@ -163,14 +164,11 @@ class TransitionNetwork(nn.Module):
         return of_windows, of_actions
 
 
-def perceptron(inputs: int, hidden: tuple[int, ...], outputs: int, last: float) -> nn.Sequential:
-    """Layers of rectified units, in float64; the last one's weights are scaled by ``last``."""
-    widths = (inputs, *hidden)
-    layers: list[nn.Module] = []
-    for before, after in pairwise(widths):
-        layers += [nn.Linear(before, after), nn.ReLU()]
-    linear = nn.Linear(widths[-1], outputs)
+def small_at_last(layers: nn.Sequential, share: float) -> nn.Sequential:
+    """In float64, with the last layer's first weights scaled by ``share``."""
+    last = layers[-1]
+    assert isinstance(last, nn.Linear)
     with torch.no_grad():
-        linear.weight.mul_(last)
-        linear.bias.mul_(last)
-    return nn.Sequential(*layers, linear).double()
+        last.weight.mul_(share)
+        last.bias.mul_(share)
+    return layers.double()

@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from solar_cli.errors import UsageError
-from solar_cli.models.networks import build
+from solar_cli.models.networks import build, perceptron
 from solar_cli.settings import TaskSettings
 from solar_cli.settings.pixel_mpc import Video
 
@@ -75,20 +75,8 @@ class VideoModel(nn.Module):
             nn.ReLU(),
             nn.Conv2d(settings.mask_channels, (1 + layers) * shape[0], 1),
         )
-        self.motion = nn.Sequential(
-            nn.Linear(seen_features + size, hidden),
-            nn.ReLU(),
-            nn.Linear(hidden, hidden),
-            nn.ReLU(),
-            nn.Linear(hidden, 2 * layers),
-        )
-        self.cost = nn.Sequential(
-            nn.Linear(seen_features, hidden),
-            nn.ReLU(),
-            nn.Linear(hidden, hidden),
-            nn.ReLU(),
-            nn.Linear(hidden, 1),
-        )
+        self.motion = perceptron(seen_features + size, (hidden, hidden), 2 * layers)
+        self.cost = perceptron(seen_features, (hidden, hidden), 1)
         self.background = nn.Parameter(torch.zeros(shape))
         for name, buffer in (
             ("frame_mean", torch.zeros(shape)),
