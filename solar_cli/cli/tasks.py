@@ -30,8 +30,13 @@ def command(
         typer.Argument(help="A card's name, or its path.", autocompletion=complete_task),
     ] = None,
     method: Annotated[
-        str, typer.Option(help="For this method.", autocompletion=complete_method)
-    ] = "solar",
+        str | None,
+        typer.Option(
+            help="For this method; else solar, or the card's first.",
+            show_default=False,
+            autocompletion=complete_method,
+        ),
+    ] = None,
     variant: Annotated[
         str, typer.Option(help="In this variant.", autocompletion=complete_variant)
     ] = "default",
@@ -61,7 +66,10 @@ def command(
 
         tell_shadowed([name])
         tell_misspelt([name])
-        resolved = resolve(load_card(name), method, variant, sets or ())
+        card = load_card(name)
+        told = card.tables.get("methods", {})
+        method = method or ("solar" if "solar" in told else next(iter(told), "solar"))
+        resolved = resolve(card, method, variant, sets or ())
         if preview is None:
             print_lines(resolved_lines(resolved, method), json)
         else:

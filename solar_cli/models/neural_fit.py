@@ -110,7 +110,8 @@ class NeuralTrainer:
 
         ``name`` keys the random draws; a fit of that name that was interrupted goes on.
         """
-        split = [max(1, round(self.settings.held_out * len(batch))) for batch in batches]
+        share = self.settings.held_out
+        split = [max(1, min(round(share * len(batch)), len(batch) - 1)) for batch in batches]
         learned = [batch.some(slice(None, -k)) for batch, k in zip(batches, split, strict=True)]
         kept = [batch.some(slice(-k, None)) for batch, k in zip(batches, split, strict=True)]
         held_out = Sequences.joined(kept)

@@ -105,10 +105,10 @@ BUILT_IN = (
         source="section 6, global model ablation",
         settings="solar_cli.settings.global_mpc:GlobalMpc",
         learner="solar_cli.methods.global_mpc:GlobalMpc",
-        deviations="a plan goes on from that of the step before, so that a fifth of the release's "
+        deviations="A plan goes on from that of the step before, so that a fifth of the release's "
         "1024 samples and fewer than its 10 iterations do; the release trained its dynamics to "
         "predict z' and rolled them out as z + f, ours predict and are rolled out as changes, over "
-        "three steps; no push forward for the car (variant forward has it)",
+        "three steps; no push forward for the car (variant forward has it).",
     ),
     MethodEntry(
         name="mpc-nn",
@@ -119,8 +119,9 @@ BUILT_IN = (
         learner="solar_cli.methods.mpc_nn:MpcNn",
         observations=("state",),
         needs="true cost",
-        deviations="their 60 passes over episodes of 1000 steps would be 120 gradient steps for "
-        "ours: 1000 an iteration, and the best by held-out episodes is kept",
+        deviations="Their 60 passes over episodes of 1000 steps would be 120 gradient steps for "
+        "ours: 1000 an iteration, and the best by held-out episodes is kept. The first episodes "
+        "are of uniform actions.",
     ),
     MethodEntry(
         name="pixel-mpc",

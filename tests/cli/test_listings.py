@@ -254,6 +254,18 @@ def test_methods_says_where_one_departs_from_its_source_and_what_it_has_beyond(
     assert "extras on" not in solar("methods", "random").out
 
 
+def test_tasks_resolves_a_card_for_its_first_method_where_solar_is_none(
+    solar: Solar, tmp_path: Path
+) -> None:
+    card = tmp_path / "mine.toml"
+    card.write_text(
+        (Path(load_card("nav").path)).read_text().split("[methods.solar]")[0]
+        + "[methods.ppo]\nbudget = { desk = 10, full = 20 }\n"
+    )
+    lines = json.loads(solar("tasks", str(card), "--json").out)
+    assert {line["path"].split(".")[1] for line in lines if "methods" in line["path"]} == {"ppo"}
+
+
 def test_every_setting_of_a_card_can_be_set_by_the_path_that_tasks_prints(solar: Solar) -> None:
     """The first column of ``solar tasks NAME`` is what ``--set`` takes."""
     from solar_cli.cli.configuration import shown

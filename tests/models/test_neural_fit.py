@@ -163,3 +163,18 @@ def test_a_loss_that_is_no_number_ends_the_fit():
     broken.states[:, 5] = torch.nan
     with pytest.raises(Diverged, match="step 0 of x"):
         fitted(batches=[broken])
+
+
+@pytest.mark.parametrize("share", [0.01, 0.99])
+def test_some_episodes_are_always_learned_from_and_some_held_out(share):
+    _, metrics = fitted(SMALL.model_copy(update={"held_out": share}))
+    assert np.isfinite(metrics["one_step_r2"])
+
+
+def test_a_fit_that_only_harms_changes_nothing():
+    model, _ = fitted()
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    harmful = SMALL.model_copy(update={"learning_rate": 30.0, "schedule": "constant"})
+    NeuralTrainer(harmful, Streams(1), lambda *_: None).fit("y", model, [episodes()], 1, 3)
+    for name, value in model.state_dict().items():
+        assert torch.equal(value, before[name])

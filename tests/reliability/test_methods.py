@@ -11,8 +11,8 @@ REFERENCE = (  # the one iteration that a policy has which learns nothing
     "collecting:7:both",
     "collected:1:worker",
     "renamed:1:both",
-    "evaluating:4:both",
     "updated:1:scheduler",
+    "evaluating:4:both",
 )
 FITTED = (*REFERENCE, "collecting:3:scheduler", "committed:1:worker")
 TRAINED = (
