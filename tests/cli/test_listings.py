@@ -260,7 +260,7 @@ def test_tasks_resolves_a_card_for_its_first_method_where_solar_is_none(
     card = tmp_path / "mine.toml"
     card.write_text(
         (Path(load_card("nav").path)).read_text().split("[methods.solar]")[0]
-        + "[methods.ppo]\nbudget = { desk = 10, full = 20 }\n"
+        + "[methods.ppo]\nhorizon = 20\nbudget = { desk = 10, full = 20 }\n"
     )
     lines = json.loads(solar("tasks", str(card), "--json").out)
     assert {line["path"].split(".")[1] for line in lines if "methods" in line["path"]} == {"ppo"}
