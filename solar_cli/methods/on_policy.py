@@ -146,7 +146,10 @@ class OnPolicyLearner(Learner, ABC):
         except ValueError as error:  # how torch's distributions refuse what is no number
             if self._finite():
                 raise
-            raise Diverged(f"update {self.rollouts + 1}: {error}") from error
+            raise Diverged(
+                f"update {self.rollouts + 1}: an action's mean or std is not finite; smaller steps "
+                "may help, or a reward_scale that makes returns small"
+            ) from error
         if not self._finite():
             raise Diverged(f"the policy after update {self.rollouts + 1} is not finite")
         logged = model.logger.name_to_value

@@ -20,6 +20,7 @@ from solar_cli.control.actor import Actor
 from solar_cli.envs import build_task
 from solar_cli.envs.stable_baselines import BatchedVecEnv
 from solar_cli.episodes import Episodes, evaluate, roll_out
+from solar_cli.errors import UsageError
 from solar_cli.methods import Diverged
 from solar_cli.methods.on_policy import LEAST_RATE, evaluated_after, seeded
 from solar_cli.methods.ppo import Ppo
@@ -478,3 +479,8 @@ def test_an_error_that_has_another_cause_is_not_divergence(tmp_path, monkeypatch
     run.learner.model._update_current_progress_remaining = lambda *_: None
     with pytest.raises(ValueError, match="something else"):
         run.iterate(1, 1)
+
+
+def test_a_step_of_trpo_needs_data(tmp_path):
+    with pytest.raises(UsageError, match="every = 13"):
+        Run(tmp_path, "trpo", f"every={ROLLOUT * HORIZON // 2 + 1}")
