@@ -163,7 +163,9 @@ def _scale(axes: Axes, problem: Problem) -> None:
         margin = 0.06 * (np.ptp(measured) or abs(measured[0]) or 1.0)
         axes.set_ylim(measured.min() - margin, measured.max() + margin)
     if min(ends) > 0 and max(ends) > LOG_EPISODES * min(ends):
-        axes.set_xscale("symlog", linthresh=min(ends) / 4)
+        counts = np.concatenate([seed.episodes for curve in problem.curves for seed in curve.seeds])
+        # Before the first of them nothing is known: iteration 0 has its place, and no more.
+        axes.set_xscale("symlog", linthresh=int(counts[counts > 0].min()), linscale=0.4)
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
         axes.set_xlim(left=0)
     else:
