@@ -1,6 +1,7 @@
 """What an environment has collected."""
 
-from solar_cli.episodes import Environment, Episodes
+from solar_cli.episodes import Episodes
+from solar_cli.experience import Environment
 
 
 def collected_in(iteration: int, environment: Environment) -> Episodes:

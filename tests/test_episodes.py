@@ -12,18 +12,9 @@ import pytest
 from collected_episodes import collected_in
 
 from solar_cli.envs import build_task
-from solar_cli.episodes import (
-    HELD,
-    Batch,
-    Environment,
-    Episodes,
-    Evaluation,
-    Experience,
-    evaluate,
-    roll_out,
-    window_indices,
-)
+from solar_cli.episodes import Batch, Episodes, Evaluation, evaluate, roll_out, window_indices
 from solar_cli.errors import SolarError
+from solar_cli.experience import HELD, Environment, Experience
 from solar_cli.settings import TaskSettings, load_card
 from solar_cli.streams import Streams
 

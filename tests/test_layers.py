@@ -13,6 +13,7 @@ LAYERS = (
     ("inference",),
     ("envs",),
     ("episodes",),
+    ("experience",),
     ("models",),
     ("control",),
     ("methods",),

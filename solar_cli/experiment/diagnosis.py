@@ -19,8 +19,9 @@ import numpy as np
 import torch
 
 from solar_cli.envs import Task, build_task
-from solar_cli.episodes import Environment, Experience, evaluate
+from solar_cli.episodes import evaluate
 from solar_cli.errors import UsageError
+from solar_cli.experience import Environment, Experience
 from solar_cli.experiment.privileged import Part, World, of_positions, privileged, seen_whole
 from solar_cli.methods import Diverged
 from solar_cli.methods.local import LocalLearner

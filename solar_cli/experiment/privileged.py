@@ -21,7 +21,8 @@ from solar_cli.control.trajectories import Trajectories
 from solar_cli.control.trust_region import TrustRegion
 from solar_cli.envs import Task
 from solar_cli.envs.task import Floats, Frames
-from solar_cli.episodes import Episodes, Experience, Policy, roll_out
+from solar_cli.episodes import Episodes, Policy, roll_out
+from solar_cli.experience import Experience
 from solar_cli.methods.local import LocalLearner
 from solar_cli.models.priors import LatentPrior
 from solar_cli.models.representation import Representation
@@ -149,15 +150,7 @@ class Privileged(LocalLearner):
         """True positions, or the method's own; one that learns none takes positions as they are."""
         if Part.STATE not in self.given or not isinstance(self.settings, LocalMethod):
             return super().make_representation()
-        return TrueState(
-            self.settings,
-            self.task,
-            self.make_prior,
-            self._cost_score,
-            self.streams,
-            self.device,
-            self.pulse,
-        )
+        return self.untrained(TrueState)
 
     def collect_and_judge(self, experience: Experience) -> TrustRegion:
         """As the method; the policy is kept, with the representation that it acts on."""

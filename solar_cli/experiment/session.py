@@ -20,8 +20,9 @@ import numpy as np
 import torch
 
 from solar_cli.envs import build_task
-from solar_cli.episodes import Environment, Episodes, Evaluation, Experience, Policy
+from solar_cli.episodes import Episodes, Evaluation, Policy
 from solar_cli.errors import SolarError
+from solar_cli.experience import Environment, Experience
 from solar_cli.experiment.checkpointing import Checkpoints
 from solar_cli.experiment.exhibits import SHOWN, exhibit
 from solar_cli.experiment.judge import Judge, measured

@@ -12,7 +12,8 @@ from solar_cli.pulse import Diverged, Pulse
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from solar_cli.episodes import Episodes, Evaluation, Experience, Policy
+    from solar_cli.episodes import Episodes, Evaluation, Policy
+    from solar_cli.experience import Experience
 
 __all__ = ["Diverged", "Foreseeing", "Learner", "Pulse"]
 

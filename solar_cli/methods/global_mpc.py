@@ -22,25 +22,24 @@ from torch import Tensor
 from solar_cli.control.exploration import Exploration, smooth_noise
 from solar_cli.control.planning import RolledOut, Search, cross_entropy, shifted
 from solar_cli.control.planning_policy import PlanningPolicy
-from solar_cli.control.quadratic_cost import fit_quadratic_cost
-from solar_cli.control.trajectories import Trajectories
-from solar_cli.episodes import Batch, Episodes, Experience, Policy
+from solar_cli.episodes import Batch, Policy
 from solar_cli.errors import UsageError
+from solar_cli.experience import Experience
 from solar_cli.methods.latent import LatentLearner
 from solar_cli.models.neural import NeuralCost, NeuralDynamics, Sequences
 from solar_cli.models.neural_fit import NeuralModel, NeuralTrainer
 from solar_cli.models.priors import Prior
-from solar_cli.models.representation import Representation
 from solar_cli.models.smoothing import linear_dynamics
 from solar_cli.pulse import Diverged, Pulse
 from solar_cli.settings import TaskSettings
 from solar_cli.settings.global_mpc import GlobalMpc as GlobalMpcSettings
-from solar_cli.settings.local import CostFit
 from solar_cli.streams import Streams
 
 
 class GlobalMpc(LatentLearner):
     """The global-model ablation on one cell."""
+
+    settings: GlobalMpcSettings
 
     def __init__(
         self,
@@ -50,7 +49,6 @@ class GlobalMpc(LatentLearner):
         device: str,
         pulse: Pulse,
     ) -> None:
-        self.settings = settings
         super().__init__(settings, task, streams, device, pulse)
         if len(settings.planner.mean) not in (0, task.action.size):
             raise UsageError(
@@ -153,24 +151,6 @@ class GlobalMpc(LatentLearner):
         """c(z) as learned, and alpha |a|^2, which is known."""
         assert self.model.cost is not None
         return self.model.cost.of(states) + self.task.action_cost * actions.square().sum(dim=-1)
-
-    def make_representation(self) -> Representation:
-        """As SOLAR's."""
-        return Representation(
-            self.settings,
-            self.task,
-            self.make_prior,
-            self._cost_score,
-            self.streams,
-            self.device,
-            self.pulse,
-        )
-
-    def _cost_score(self, representation: Representation, batches: list[Episodes]) -> float:
-        """As SOLAR judges whether a representation is alive: by a quadratic cost."""
-        states = [Trajectories.of(representation.embed(one).cpu(), one) for one in batches]
-        joined = Trajectories.joined(states)
-        return fit_quadratic_cost(joined, [], self.task.action_cost, CostFit(), self.latent).r2
 
     def state_dict(self) -> dict[str, Any]:
         """Representation, networks, and a fit that is under way."""

@@ -7,13 +7,16 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from solar_cli.control.quadratic_cost import FittedCost, fit_quadratic_cost
+from solar_cli.control.trajectories import Trajectories
 from solar_cli.episodes import Episodes, Evaluation
 from solar_cli.models.diagnostics import latent_metrics
 from solar_cli.models.priors import Prior
+from solar_cli.models.representation import Representation
 from solar_cli.models.state_representation import StateRepresentation
 from solar_cli.pulse import Pulse
 from solar_cli.settings import TaskSettings
-from solar_cli.settings.local import StateMethod
+from solar_cli.settings.local import CostFit, LatentMethod, StateMethod
 from solar_cli.streams import Streams
 
 
@@ -28,6 +31,7 @@ class LatentLearner(ABC):
         device: str,
         pulse: Pulse,
     ) -> None:
+        self.settings = settings
         self.task = task
         self.streams = streams
         self.device = device
@@ -36,12 +40,38 @@ class LatentLearner(ABC):
         self.representation = self.make_representation()
 
     @abstractmethod
-    def make_representation(self) -> StateRepresentation:
-        """An untrained representation."""
-
-    @abstractmethod
     def make_prior(self) -> Prior:
         """The prior over latents that the representation is trained with."""
+
+    def make_representation(self) -> StateRepresentation:
+        """An untrained representation."""
+        return self.untrained(Representation)
+
+    def untrained(self, kind: type[Representation]) -> Representation:
+        """A representation of that kind, which is to be learned."""
+        assert isinstance(self.settings, LatentMethod)
+        return kind(
+            self.settings,
+            self.task,
+            self.make_prior,
+            self._cost_score,
+            self.streams,
+            self.device,
+            self.pulse,
+        )
+
+    @property
+    def cost_fit(self) -> CostFit:
+        """How a quadratic cost is fitted: it tells whether a representation is alive."""
+        return CostFit()
+
+    def fitted_cost(self, states: Trajectories, older: list[Trajectories]) -> FittedCost:
+        """The quadratic cost of the newest latents (section 3)."""
+        return fit_quadratic_cost(states, older, self.task.action_cost, self.cost_fit, self.latent)
+
+    def _cost_score(self, representation: StateRepresentation, batches: list[Episodes]) -> float:
+        states = [Trajectories.of(representation.embed(one).cpu(), one) for one in batches]
+        return self.fitted_cost(Trajectories.joined(states), []).r2
 
     def diagnose(self, evaluation: Evaluation) -> dict[str, float]:
         """R2 of linear maps between true positions and the newest latents, both ways."""

@@ -23,19 +23,18 @@ from solar_cli.control.linear_gaussian import (
 from solar_cli.control.linearise import Linearisation, linearise_policy
 from solar_cli.control.local_dynamics import LocalDynamics, infer_dynamics
 from solar_cli.control.lqr import Outcome, PolicyUpdate
-from solar_cli.control.quadratic_cost import FittedCost, fit_quadratic_cost
 from solar_cli.control.step_size import StepSize
 from solar_cli.control.task_checks import task_metrics
 from solar_cli.control.trajectories import Trajectories
 from solar_cli.control.trust_region import Anchor, TrustRegion, promised_fall
-from solar_cli.episodes import Episodes, Experience
+from solar_cli.episodes import Episodes
+from solar_cli.experience import Experience
 from solar_cli.methods.latent import LatentLearner
 from solar_cli.models.priors import LatentPrior
-from solar_cli.models.representation import Representation
 from solar_cli.models.state_representation import StateRepresentation
 from solar_cli.pulse import Diverged, Pulse
 from solar_cli.settings import TaskSettings
-from solar_cli.settings.local import LocalControl, LocalMethod
+from solar_cli.settings.local import CostFit, LocalControl
 from solar_cli.streams import Streams
 
 MOST_BATCHES = 4
@@ -45,6 +44,8 @@ MOST_BATCHES = 4
 class LocalLearner(LatentLearner):
     """A representation, a linear-Gaussian policy on its states, and the rules around an update."""
 
+    settings: LocalControl
+
     def __init__(
         self,
         settings: LocalControl,
@@ -53,7 +54,6 @@ class LocalLearner(LatentLearner):
         device: str,
         pulse: Pulse,
     ) -> None:
-        self.settings = settings
         super().__init__(settings, task, streams, device, pulse)
         self.gains = initial_policy(
             task.horizon, self.representation.state_size, task.action.size, task.exploration.std
@@ -67,18 +67,10 @@ class LocalLearner(LatentLearner):
     def iterate(self, experience: Experience) -> dict[str, float]:
         """As `Learner.iterate`: one turn of Algorithm 1."""
 
-    def make_representation(self) -> StateRepresentation:
-        """An untrained representation."""
-        assert isinstance(self.settings, LocalMethod)
-        return Representation(
-            self.settings,
-            self.task,
-            self.make_prior,
-            self._cost_score,
-            self.streams,
-            self.device,
-            self.pulse,
-        )
+    @property
+    def cost_fit(self) -> CostFit:
+        """As the settings say."""
+        return self.settings.cost_fit
 
     @property
     def policy(self) -> LatentPolicy:
@@ -212,12 +204,6 @@ class LocalLearner(LatentLearner):
         """Line 7: local dynamics around the newest latents."""
         return infer_dynamics(states, older, prior, self.settings.local_fit, streams)
 
-    def fitted_cost(self, states: Trajectories, older: list[Trajectories]) -> FittedCost:
-        """The quadratic cost of the newest latents (section 3)."""
-        return fit_quadratic_cost(
-            states, older, self.task.action_cost, self.settings.cost_fit, self.latent
-        )
-
     def checked(self, states: Trajectories, older: list[Trajectories]) -> dict[str, float]:
         """Whether the task shows the last action, and whether episodes are held somewhere."""
         task = self.task
@@ -285,7 +271,3 @@ class LocalLearner(LatentLearner):
         self.handed = LinearGaussianPolicy(*state["handed"])
         self.trust_region = self.trust_region.restored(state["trust_region"])
         self.updates = state["updates"]
-
-    def _cost_score(self, representation: StateRepresentation, batches: list[Episodes]) -> float:
-        states = Trajectories.joined([self._embedded(representation, one) for one in batches])
-        return self.fitted_cost(states, []).r2

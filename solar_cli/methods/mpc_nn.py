@@ -21,8 +21,9 @@ from solar_cli.control.exploration import Exploration
 from solar_cli.control.planning import RolledOut, random_shooting
 from solar_cli.control.planning_policy import PlanningPolicy
 from solar_cli.envs import state_cost
-from solar_cli.episodes import Experience, Policy
+from solar_cli.episodes import Policy
 from solar_cli.errors import UsageError
+from solar_cli.experience import Experience
 from solar_cli.methods import Learner
 from solar_cli.methods.reference import Fixed
 from solar_cli.models.basis import LatentBasis

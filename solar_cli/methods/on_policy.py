@@ -32,7 +32,8 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from solar_cli.control.actor import Actor, stacked
 from solar_cli.envs.spaces import observation_space
-from solar_cli.episodes import Episodes, Experience, window_indices
+from solar_cli.episodes import Episodes, window_indices
+from solar_cli.experience import Experience
 from solar_cli.methods import Learner
 from solar_cli.models.actor_critic import ActorCriticOfLayers
 from solar_cli.pulse import Diverged, Pulse

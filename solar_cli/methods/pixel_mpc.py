@@ -24,7 +24,8 @@ from torch import Tensor
 
 from solar_cli.control.exploration import Exploration, smooth_noise
 from solar_cli.control.planning import Search, cross_entropy
-from solar_cli.episodes import Episodes, Evaluation, Experience, Policy
+from solar_cli.episodes import Episodes, Evaluation, Policy
+from solar_cli.experience import Experience
 from solar_cli.methods import Learner
 from solar_cli.models.video import CHUNK, VideoModel
 from solar_cli.models.video_training import ClipData, VideoTrainer, errors

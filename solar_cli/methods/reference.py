@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from solar_cli.episodes import Experience, Policy
+from solar_cli.episodes import Policy
+from solar_cli.experience import Experience
 from solar_cli.methods import Learner
 from solar_cli.pulse import Pulse
 from solar_cli.settings import TaskSettings

@@ -8,7 +8,7 @@ another model into the same page.
 from __future__ import annotations
 
 from solar_cli.control.lqr import improve_policy
-from solar_cli.episodes import Experience
+from solar_cli.experience import Experience
 from solar_cli.methods.local import LocalLearner
 from solar_cli.models.priors import Prior
 from solar_cli.models.smoothing import linear_dynamics

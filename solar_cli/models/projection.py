@@ -15,7 +15,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from solar_cli.episodes import Episodes, Experience
+from solar_cli.episodes import Episodes
+from solar_cli.experience import Experience
 from solar_cli.models.basis import LatentBasis, windows_of
 from solar_cli.models.likelihoods import explained_variance
 from solar_cli.models.priors import LatentPrior

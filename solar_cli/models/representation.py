@@ -17,8 +17,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from solar_cli.episodes import Batch, Episodes, Experience
+from solar_cli.episodes import Batch, Episodes
 from solar_cli.errors import UsageError
+from solar_cli.experience import Experience
 from solar_cli.inference import mniw
 from solar_cli.models.basis import LatentBasis, windows_of
 from solar_cli.models.frames import FrameModel

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from solar_cli.episodes import Episodes, Experience
+from solar_cli.episodes import Episodes
+from solar_cli.experience import Experience
 from solar_cli.models.basis import LatentBasis
 from solar_cli.models.priors import LatentPrior
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
@@ -234,9 +235,9 @@ class StateMethod(Settings):
         True, "states have unit variance, and differences in place of older latents", added=True
     )
 
+    @abstractmethod
     def latents(self, observation: Observation) -> int:
         """d: latents that one frame shows."""
-        raise NotImplementedError
 
 
 class LatentMethod(StateMethod):

@@ -27,7 +27,7 @@ from torch import nn
 from solar_cli.envs import build_task
 from solar_cli.envs.front_ends import IDS
 from solar_cli.envs.stable_baselines import BatchedVecEnv
-from solar_cli.episodes import Environment, Experience
+from solar_cli.experience import Environment, Experience
 from solar_cli.methods.on_policy import evaluated_after
 from solar_cli.methods.ppo import Ppo
 from solar_cli.settings import load_card, resolve

@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from solar_cli.episodes import Episodes, Evaluation, Experience
+from solar_cli.episodes import Episodes, Evaluation
+from solar_cli.experience import Experience
 from solar_cli.methods import Diverged, Pulse
 from solar_cli.settings import MethodEntry, TaskSettings
 from solar_cli.settings.local import Budget

@@ -16,8 +16,9 @@ from solar_cli.control import quadratic_cost
 from solar_cli.control.trajectories import Trajectories
 from solar_cli.envs import build_task
 from solar_cli.envs.navigation import Navigation
-from solar_cli.episodes import Environment, Episodes, Experience
+from solar_cli.episodes import Episodes
 from solar_cli.errors import UsageError
+from solar_cli.experience import Environment, Experience
 from solar_cli.experiment import privileged
 from solar_cli.experiment.diagnosis import ALL, AS_IT_IS, diagnose, local_learner, parts
 from solar_cli.experiment.privileged import ROLLOUTS, Part, World, of_positions, seen_whole

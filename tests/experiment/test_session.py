@@ -13,8 +13,8 @@ from bits import OF_THE_MACHINE, files_of, fingerprint, metric_digest, state_dig
 from collected_episodes import collected_in
 
 from solar_cli.envs.task import RowTask
-from solar_cli.episodes import Environment
 from solar_cli.errors import LostFiles, SolarError
+from solar_cli.experience import Environment
 from solar_cli.experiment import checkpointing, session
 from solar_cli.experiment.judge import Judge
 from solar_cli.experiment.messages import Message

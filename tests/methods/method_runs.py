@@ -10,7 +10,7 @@ import numpy as np
 from bits import digest, through_a_file
 
 from solar_cli.envs import build_task
-from solar_cli.episodes import Environment, Experience
+from solar_cli.experience import Environment, Experience
 from solar_cli.settings import cells, load, load_card, method
 from solar_cli.streams import Streams
 

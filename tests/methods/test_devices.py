@@ -8,7 +8,7 @@ import torch
 from collected_episodes import collected_in
 
 from solar_cli.envs import build_task
-from solar_cli.episodes import Environment, Experience
+from solar_cli.experience import Environment, Experience
 from solar_cli.settings import card_names, cells, load, load_card, method
 from solar_cli.streams import Streams
 

@@ -6,7 +6,8 @@ import torch
 from collected_episodes import collected_in
 from method_runs import Run
 
-from solar_cli.episodes import Batch, Experience, window_indices
+from solar_cli.episodes import Batch, window_indices
+from solar_cli.experience import Experience
 from solar_cli.methods import solar
 from solar_cli.models.representation import Representation
 

@@ -10,7 +10,8 @@ from method_runs import Run
 
 from solar_cli.control import trust_region
 from solar_cli.envs import build_task
-from solar_cli.episodes import Batch, Episodes, Evaluation, Experience, evaluate
+from solar_cli.episodes import Batch, Episodes, Evaluation, evaluate
+from solar_cli.experience import Experience
 from solar_cli.methods import Diverged, local, solar
 from solar_cli.streams import Streams
 

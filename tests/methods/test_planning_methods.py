@@ -9,8 +9,9 @@ from bits import digest
 from method_runs import Run
 
 from solar_cli.envs import build_task
-from solar_cli.episodes import Experience, evaluate
+from solar_cli.episodes import evaluate
 from solar_cli.errors import UsageError
+from solar_cli.experience import Experience
 from solar_cli.pulse import Diverged
 from solar_cli.streams import Streams
 

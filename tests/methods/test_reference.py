@@ -5,7 +5,8 @@ import pytest
 from method_runs import Run
 
 from solar_cli.envs import build_task
-from solar_cli.episodes import Experience, evaluate
+from solar_cli.episodes import evaluate
+from solar_cli.experience import Experience
 from solar_cli.streams import Streams
 
 

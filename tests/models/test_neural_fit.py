@@ -163,6 +163,8 @@ def test_a_loss_that_is_no_number_ends_the_fit():
     broken.states[:, 5] = torch.nan
     with pytest.raises(Diverged, match="step 0 of x"):
         fitted(batches=[broken])
+    with pytest.raises(Diverged, match="step 40 of x"):
+        fitted(SMALL.model_copy(update={"learning_rate": 1e30}))
 
 
 @pytest.mark.parametrize("share", [0.01, 0.99])

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 from solar_cli.envs.task import LoopTask, RowTask
-from solar_cli.episodes import Environment
+from solar_cli.experience import Environment
 from solar_cli.experiment import checkpointing, session, worker
 from solar_cli.experiment.judge import Judge
 from solar_cli.store.store import Store

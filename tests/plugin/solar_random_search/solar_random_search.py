@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from solar_cli.episodes import Episodes, Evaluation, Experience
+from solar_cli.episodes import Episodes, Evaluation
+from solar_cli.experience import Experience
 from solar_cli.methods import Pulse
 from solar_cli.settings import MethodEntry, TaskSettings
 from solar_cli.settings.local import Budget
