@@ -132,7 +132,7 @@ class PixelMpc(Learner):
             torch.manual_seed(streams.seed63("weights"))
             model = VideoModel(settings.video, task)
         self.model = model.to(device)
-        self.trainer = VideoTrainer(settings.training, streams.under("video"), device, pulse)
+        self.trainer = VideoTrainer(settings.training, streams.under("video"), pulse)
         self.trained = False
 
     @property

@@ -1,19 +1,18 @@
 """The one fit of neural models to episodes: dynamics, and where it is to be learned, the cost.
 
 Part of each batch of episodes is held out: it says which step's parameters are kept, and how good
-they are. A fit can stop at any pulse and go on with the same bits, as `models.training` can.
+they are.
 """
 
 from __future__ import annotations
 
 import math
-import time
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from solar_cli.models.descent import Descent
 from solar_cli.models.neural import (
     NeuralCost,
     NeuralDynamics,
@@ -88,15 +87,13 @@ class NeuralModel(nn.Module):
         return total
 
 
-class NeuralTrainer:
+class NeuralTrainer(Descent):
     """Adam on `NeuralModel.loss`; the parameters that held-out segments like best are kept."""
 
     def __init__(self, settings: NeuralFit, streams: Streams, pulse: Pulse) -> None:
+        super().__init__("training the networks", JUDGED_STEPS, pulse)
         self.settings = settings
         self.streams = streams
-        self.pulse = pulse
-        self._running: dict[str, Any] | None = None
-        self._optimiser: torch.optim.Adam | None = None
 
     def fit(
         self,
@@ -129,81 +126,44 @@ class NeuralTrainer:
         }
         if model.cost is not None:
             metrics["cost_r2"] = cost_r2(model.cost, held_out)
-        return {**self._end(), **metrics}
-
-    def _train(self, name: str, model: NeuralModel, draws: Minibatches, judged: Segment) -> None:
-        optimiser = torch.optim.Adam(model.parameters(), lr=self.settings.learning_rate)
-        if self._running is None or self._running["name"] != name:
-            start = {key: value.clone() for key, value in model.state_dict().items()}
-            self._running = {
-                "name": name,
-                "step": 0,
-                "least": math.inf,
-                "kept": start,
-                "kept_step": 0,
-                "seconds": 0.0,
-            }
-        elif "optimiser" in self._running:
-            optimiser.load_state_dict(self._running.pop("optimiser"))
-        self._optimiser = optimiser
-        running, last, settings = self._running, time.perf_counter(), self.settings
-        if running["step"] == 0:  # what there was before is kept where nothing beats it
-            self._judge(model, judged)
-        while running["step"] < settings.steps:
-            rate = settings.learning_rate
-            if settings.schedule == "cosine":
-                rate *= 0.5 * (1 + math.cos(math.pi * running["step"] / settings.steps))
-            for group in optimiser.param_groups:
-                group["lr"] = rate
-            segment, noise = draws.draw(self.streams.generator(name, running["step"]))
-            loss = model.loss(segment, noise)
-            optimiser.zero_grad()
-            torch.autograd.backward(loss)
-            optimiser.step()
-            running["step"] += 1
-            if running["step"] % JUDGED_STEPS and running["step"] < settings.steps:
-                continue
-            self._judge(model, judged)
-            running["seconds"] += time.perf_counter() - last
-            self.pulse(f"training the networks ({name})", running["step"] / settings.steps)
-            last = time.perf_counter()
-        model.load_state_dict(running["kept"])
-
-    @torch.no_grad()
-    def _judge(self, model: NeuralModel, judged: Segment) -> None:
-        """Keep the parameters of now, where held-out segments say that they are the best."""
-        running = self._running
-        assert running is not None
-        loss = float(model.loss(judged))
-        if not math.isfinite(loss):
-            raise Diverged(f"step {running['step']} of {running['name']}: the loss is not finite")
-        if loss < running["least"]:
-            kept = {key: value.clone() for key, value in model.state_dict().items()}
-            running.update(least=loss, kept=kept, kept_step=running["step"])
-
-    def _end(self) -> dict[str, float]:
-        running = self._running
-        assert running is not None
-        self._running = self._optimiser = None
+        record = self.end()
         return {
-            "held_out_loss": running["least"],
-            "kept_step": float(running["kept_step"]),
-            "seconds_training": running["seconds"],
+            "held_out_loss": record["least"],
+            "kept_step": float(record["kept_step"]),
+            "seconds_training": record["seconds"],
+            **metrics,
         }
 
-    def state_dict(self) -> dict[str, Any]:
-        """A fit that is under way: its step, what is kept, and the optimiser."""
-        if self._running is None:
-            return {}
-        state = dict(self._running)
-        if self._optimiser is not None:
-            state["optimiser"] = self._optimiser.state_dict()
-        return state
+    def _train(self, name: str, model: NeuralModel, draws: Minibatches, judged: Segment) -> None:
+        settings = self.settings
+        optimiser = torch.optim.Adam(model.parameters(), lr=settings.learning_rate)
+        for step in self.steps(
+            name, optimiser, settings.steps, self._rate, least=math.inf, kept={}, kept_step=0
+        ):
+            if step.number == 0:  # what there was before is kept where nothing beats it
+                self._judge(model, judged, 0)
+            segment, noise = draws.draw(self.streams.generator(name, step.number))
+            self.descend(model.loss(segment, noise))
+            if step.pausing:
+                self._judge(model, judged, step.number + 1)
+        model.load_state_dict(self.record["kept"])
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take up a fit that was under way; it goes on when ``fit`` is called with its name."""
-        self._running = dict(state) or None
-        self._optimiser = None
+    def _rate(self, share: float) -> float:
+        rate = self.settings.learning_rate
+        if self.settings.schedule == "constant":
+            return rate
+        return rate * 0.5 * (1 + math.cos(math.pi * share))
+
+    @torch.no_grad()
+    def _judge(self, model: NeuralModel, judged: Segment, step: int) -> None:
+        """Keep the parameters of now, where held-out segments say that they are the best."""
+        loss = float(model.loss(judged))
+        if not math.isfinite(loss):
+            name = self.record["name"]
+            raise Diverged(f"step {step} of {name}: the loss is not finite")
+        if loss < self.record["least"]:
+            kept = {name: value.clone() for name, value in model.state_dict().items()}
+            self.record.update(least=loss, kept=kept, kept_step=step)
 
 
 class Minibatches:

@@ -1,13 +1,8 @@
-"""The one training loop: stochastic gradients for networks, natural gradients for the prior.
-
-It can stop after any step and go on with the same bits: what a step draws is keyed by its number,
-and `Trainer.state_dict` holds the rest.
-"""
+"""Training of a latent model: stochastic gradients for networks, natural ones for the prior."""
 
 from __future__ import annotations
 
 import math
-import time
 from typing import Any
 
 import numpy as np
@@ -17,6 +12,7 @@ from torch import Tensor
 
 from solar_cli.episodes import Episodes
 from solar_cli.errors import SolarError
+from solar_cli.models.descent import Descent
 from solar_cli.models.latent_model import LatentModel, Minibatch
 from solar_cli.pulse import Diverged, Pulse
 from solar_cli.settings.local import Training
@@ -26,16 +22,14 @@ PULSE_STEPS = 20
 SMOOTHING = 0.98  # of the ELBO terms that are reported: an average over about 50 steps
 
 
-class Trainer:
+class Trainer(Descent):
     """Runs `LatentModel.loss` for a number of steps on batches of episodes."""
 
     def __init__(self, settings: Training, streams: Streams, device: str, pulse: Pulse) -> None:
+        super().__init__("training the model", PULSE_STEPS, pulse)
         self.settings = settings
         self.streams = streams
         self.device = device
-        self.pulse = pulse
-        self._running: dict[str, Any] | None = None
-        self._optimiser: torch.optim.Adam | None = None
 
     def fit(
         self,
@@ -53,56 +47,25 @@ class Trainer:
         """
         data, fine_tuning = Dataset(batches, self.device, newest), newest > 0
         optimiser = torch.optim.Adam(model.parameters(), lr=self.settings.learning_rate, fused=True)
-        if self._running is None or self._running["name"] != name:
-            self._running = {"name": name, "step": 0, "terms": {}, "seconds": 0.0}
-        elif "optimiser" in self._running:
-            optimiser.load_state_dict(self._running.pop("optimiser"))
-        self._optimiser = optimiser
-        running, last = self._running, time.perf_counter()
-        while running["step"] < steps:
-            share = running["step"] / steps
-            for group in optimiser.param_groups:
-                group["lr"] = self._rate(share, fine_tuning)
-            draws = self.streams.generator("minibatch", name, running["step"])
-            latent = model.networks.settings.latent
-            batch = data.minibatch(self.settings, draws, latent)
-            weight = self.settings.kl_end if fine_tuning else self._kl_weight(share)
-            running["step"] += 1
-            place = f"step {running['step']} of {name}"
-            try:
-                loss, terms = self._step(model, optimiser, batch, weight, data.scale(batch))
-            except torch.linalg.LinAlgError as error:  # type: ignore[attr-defined]
-                raise Diverged(f"{place}: {error}") from error
-            self._smooth(running["terms"], terms)
-            pausing = running["step"] % PULSE_STEPS == 0
-            # Read now and then only: reading a number waits for the device.
-            if (pausing or running["step"] == steps) and not math.isfinite(float(loss)):
-                raise Diverged(f"{place}: the loss is not finite")
-            if pausing:
-                running["seconds"] += time.perf_counter() - last
-                self.pulse(f"training the model ({name})", running["step"] / steps)
-                last = time.perf_counter()  # a pulse may take its time to save
-        self._running = self._optimiser = None
-        seconds = running["seconds"] + time.perf_counter() - last
-        smoothed = {term: float(value) for term, value in running["terms"].items()}
-        return {**smoothed, "seconds_training": seconds}
+        latent = model.networks.settings.latent
 
-    def _step(
-        self,
-        model: LatentModel,
-        optimiser: torch.optim.Adam,
-        batch: Minibatch,
-        kl_weight: float,
-        scale: float,
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """A step of Adam on the networks and one of natural gradient on the prior."""
-        loss, statistics, terms = model.loss(batch, kl_weight)
-        optimiser.zero_grad()
-        torch.autograd.backward(loss)
-        torch.nn.utils.clip_grad_norm_(model.parameters(), self.settings.clip, foreach=True)
-        optimiser.step()
-        model.prior.learn(statistics, scale)
-        return loss.detach(), terms
+        def rate(share: float) -> float:
+            return self._rate(share, fine_tuning)
+
+        for step in self.steps(name, optimiser, steps, rate, terms={}):
+            draws = self.streams.generator("minibatch", name, step.number)
+            batch = data.minibatch(self.settings, draws, latent)
+            weight = self.settings.kl_end if fine_tuning else self._kl_weight(step.share)
+            try:
+                loss, statistics, terms = model.loss(batch, weight)
+                self.descend(loss, self.settings.clip)
+                model.prior.learn(statistics, data.scale(batch))
+            except torch.linalg.LinAlgError as error:  # type: ignore[attr-defined]
+                raise Diverged(f"{self.place}: {error}") from error
+            self._smooth(self.record["terms"], terms)
+        record = self.end()
+        smoothed = {term: float(value) for term, value in record["terms"].items()}
+        return {**smoothed, "seconds_training": record["seconds"]}
 
     def _rate(self, share: float, fine_tuning: bool) -> float:
         if fine_tuning:
@@ -126,23 +89,10 @@ class Trainer:
             old = terms.get(name)
             terms[name] = value if old is None else SMOOTHING * old + (1 - SMOOTHING) * value
 
-    @property
-    def under_way(self) -> bool:
-        """Whether a run was interrupted that the next ``fit`` of its name takes up."""
-        return self._running is not None
-
     def state_dict(self) -> dict[str, Any]:
         """A run that is under way: its step, smoothed terms and optimiser."""
-        if self._running is None:
-            return {}
-        optimiser = self._optimiser
-        state = {**self._running, "terms": dict(self._running["terms"])}
-        return state if optimiser is None else {**state, "optimiser": optimiser.state_dict()}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take up a run that was under way; it goes on when ``fit`` is called with its name."""
-        self._running = dict(state) or None
-        self._optimiser = None
+        state = super().state_dict()
+        return {**state, "terms": dict(state["terms"])} if state else {}
 
 
 class Dataset:

@@ -1,14 +1,10 @@
-"""Training of the video model: clips of episodes, and descent that can stop after any step.
-
-What a step draws is keyed by its number, and `VideoTrainer.state_dict` holds the rest.
-"""
+"""Training of the video model on clips of episodes."""
 
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,8 +14,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from solar_cli.episodes import Episodes
+from solar_cli.models.descent import Descent
 from solar_cli.models.video import VideoModel
-from solar_cli.pulse import Diverged, Pulse
+from solar_cli.pulse import Pulse
 from solar_cli.settings.pixel_mpc import VideoTraining
 from solar_cli.streams import Streams
 
@@ -134,16 +131,12 @@ def pooled_error(residual: Float[Tensor, "N H C h w"], side: int) -> Float[Tenso
     return pooled.square().sum(dim=(1, 2, 3)).view(residual.shape[:2]).sum(dim=0)
 
 
-class VideoTrainer:
+class VideoTrainer(Descent):
     """Descent on the error of frames, over that of copying the last one seen, and that of costs."""
 
-    def __init__(
-        self, settings: VideoTraining, streams: Streams, device: str, pulse: Pulse
-    ) -> None:
+    def __init__(self, settings: VideoTraining, streams: Streams, pulse: Pulse) -> None:
+        super().__init__("training the video model", PULSE_STEPS, pulse)
         self.settings, self.streams = settings, streams
-        self.device, self.pulse = device, pulse
-        self._running: dict[str, Any] | None = None
-        self._optimiser: torch.optim.Adam | None = None
 
     def fit(self, name: str, model: VideoModel, data: ClipData, *, first: bool) -> dict[str, float]:
         """Train; the mean errors of the last pulse's steps.
@@ -152,54 +145,21 @@ class VideoTrainer:
         """
         settings = self.settings
         steps = settings.steps if first else settings.later_steps
-        rate = settings.learning_rate if first else settings.later_rate
-        optimiser = torch.optim.Adam(model.parameters(), lr=rate, fused=True)
-        if self._running is None or self._running["name"] != name:
-            self._running = {"name": name, "step": 0, "errors": (0.0, 0.0), "seconds": 0.0}
-        elif "optimiser" in self._running:
-            optimiser.load_state_dict(self._running.pop("optimiser"))
-        self._optimiser, running, last = optimiser, self._running, time.perf_counter()
-        while running["step"] < steps:
-            share = running["step"] / steps
-            for group in optimiser.param_groups:
-                group["lr"] = rate * 0.5 * (1 + math.cos(math.pi * share))
-            draws = self.streams.generator(name, running["step"])
+        highest = settings.learning_rate if first else settings.later_rate
+        optimiser = torch.optim.Adam(model.parameters(), lr=highest, fused=True)
+
+        def rate(share: float) -> float:
+            return highest * 0.5 * (1 + math.cos(math.pi * share))
+
+        for step in self.steps(name, optimiser, steps, rate, errors=(0.0, 0.0)):
+            draws = self.streams.generator(name, step.number)
             found = errors(model, data.drawn(settings.clips, draws))
             pairs = zip(found.frames, found.still, strict=True)
             ratios = [wrong.sum() / still.sum().clamp_min(1e-6) for wrong, still in pairs]
             frames = torch.stack(ratios).mean()
-            loss = frames + found.costs
-            optimiser.zero_grad()
-            torch.autograd.backward(loss)
-            torch.nn.utils.clip_grad_norm_(model.parameters(), settings.clip, foreach=True)
-            optimiser.step()
-            running["step"] += 1
-            if running["step"] % PULSE_STEPS and running["step"] < steps:
-                continue
-            running["errors"] = (float(frames.detach()), float(found.costs.detach()))
-            if not math.isfinite(sum(running["errors"])):
-                raise Diverged(f"step {running['step']} of {name}: the loss is not finite")
-            running["seconds"] += time.perf_counter() - last
-            self.pulse(f"training the video model ({name})", running["step"] / steps)
-            last = time.perf_counter()  # a pulse may take its time to save
-        self._running = self._optimiser = None
-        losses = dict(zip(("loss_frames", "loss_costs"), running["errors"], strict=True))
-        return {**losses, "seconds_training": running["seconds"]}
-
-    @property
-    def under_way(self) -> bool:
-        """Whether a run was interrupted that the next ``fit`` of its name takes up."""
-        return self._running is not None
-
-    def state_dict(self) -> dict[str, Any]:
-        """A run that is under way: its step, errors and optimiser."""
-        if self._running is None:
-            return {}
-        optimiser = self._optimiser
-        state = dict(self._running)
-        return state if optimiser is None else {**state, "optimiser": optimiser.state_dict()}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take up a run that was under way; it goes on when ``fit`` is called with its name."""
-        self._running = dict(state) or None
-        self._optimiser = None
+            self.descend(frames + found.costs, settings.clip)
+            if step.pausing:
+                self.record["errors"] = (float(frames.detach()), float(found.costs.detach()))
+        record = self.end()
+        losses = dict(zip(("loss_frames", "loss_costs"), record["errors"], strict=True))
+        return {**losses, "seconds_training": record["seconds"]}

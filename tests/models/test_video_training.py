@@ -106,7 +106,7 @@ def trained(steps, pulse=lambda *_: None, batches=None) -> SimpleNamespace:
         clips.frames[:, :-1].flatten(0, 1), *(x.flatten(0, 1) for x in (clips.actions, clips.costs))
     )
     settings = VideoTraining(steps=steps, clips=16, learning_rate=1e-2)
-    trainer = VideoTrainer(settings, Streams(0), "cpu", pulse)
+    trainer = VideoTrainer(settings, Streams(0), pulse)
     return SimpleNamespace(model=of, data=clips, trainer=trainer)
 
 
