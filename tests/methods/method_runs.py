@@ -1,4 +1,4 @@
-"""A method at work on the smoke variant of nav, made smaller still."""
+"""A method at work on the smoke variant of nav, or of a task that it can do, made smaller still."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ SMALL: dict[str, tuple[str, ...]] = {
     "zero": (),
 }
 """the same for others"""
+TASKS = {"mpc-nn": "car-states"}
 
 
 class Run:
@@ -44,11 +45,10 @@ class Run:
         pulse: Callable[[str, float], None] = lambda *_: None,
         wrap: Callable[[Any], Any] = lambda task: task,
         costs: Callable[[int, np.ndarray], np.ndarray] | None = None,
-        task: str = "nav",
     ) -> None:
         small = (*SMALL.get(name, LOCAL), *sets)
         changes = ["task.horizon=6", *(f"methods.{name}.{text}" for text in small)]
-        [cell] = cells(load_card(task), name, [seed], "smoke", changes)
+        [cell] = cells(load_card(TASKS.get(name, "nav")), name, [seed], "smoke", changes)
         self.configuration = cell.configuration
         streams, settings = Streams(seed), cell.configuration.task
         simulator = wrap(build_task(settings))

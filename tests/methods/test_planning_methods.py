@@ -1,7 +1,5 @@
 """MPC-NN and the global-model ablation: what is SOLAR's in them, how they stop, what they plan."""
 
-from itertools import count
-
 import numpy as np
 import pytest
 import torch
@@ -15,12 +13,7 @@ from solar_cli.experience import Experience
 from solar_cli.pulse import Diverged
 from solar_cli.streams import Streams
 
-TASKS = {"global-mpc": "nav", "mpc-nn": "car-states"}
 FINE_TUNED = ("training.fine_tune_steps=8", "training.fine_tune_rate=0.003")
-
-
-def run(folder, name: str, *sets: str, **rest) -> Run:
-    return Run(folder, name, *sets, task=TASKS.get(name, "nav"), **rest)
 
 
 # The representation
@@ -50,54 +43,10 @@ def test_states_are_embedded_anew_when_the_representation_has_moved(tmp_path):
 # Stopping
 
 
-@pytest.mark.parametrize(
-    ("name", "sets", "pulses"),
-    [
-        # Twelve steps of each training, a pulse every four.
-        ("global-mpc", (), 3 + 3 * 3),
-        ("global-mpc", FINE_TUNED, 3 + 2 * 2 + 3 * 3),
-        ("mpc-nn", (), 3 * 3),
-    ],
-    ids=["global-mpc", "global-mpc fine-tuned", "mpc-nn"],
-)
-def test_a_run_interrupted_at_any_pulse_ends_with_the_same_bits(tmp_path, name, sets, pulses):
-    last, saved = 3, []
-    whole = run(
-        tmp_path,
-        name,
-        *sets,
-        pulse=lambda *_: saved.append((whole.environment.iteration, whole.state())),
-    )
-    whole.iterate(1, last)
-    assert len(saved) == pulses
-    for iteration, state in saved:
-        resumed = run(tmp_path, name, *sets).restore(state).iterate(iteration, last)
-        assert repr(resumed.metrics) == repr(whole.metrics[iteration - 1 :])
-        assert resumed.bits() == whole.bits()
-
-
-@pytest.mark.parametrize("name", ["global-mpc", "mpc-nn", "random", "zero"])
-def test_a_run_interrupted_while_it_collects_ends_with_the_same_bits(tmp_path, name):
-    last, saved, steps = 3, [], count(1)
-
-    def halfway(iteration, costs):
-        if next(steps) % 6 == 3:  # of the six steps of an episode
-            saved.append((iteration, whole.state()))
-        return costs
-
-    whole = run(tmp_path, name, costs=halfway)
-    whole.iterate(1, last)
-    assert [iteration for iteration, _ in saved] == [1, 2, 3]
-    for iteration, state in saved:
-        resumed = run(tmp_path, name).restore(state).iterate(iteration, last)
-        assert repr(resumed.metrics) == repr(whole.metrics[iteration - 1 :])
-        assert resumed.bits() == whole.bits()
-
-
 @pytest.mark.parametrize("name", ["global-mpc", "mpc-nn"])
 def test_a_restored_learner_acts_as_the_one_that_was_saved(tmp_path, name):
-    whole = run(tmp_path, name).iterate(1, 2)
-    restored = run(tmp_path, name).restore(whole.state())
+    whole = Run(tmp_path, name).iterate(1, 2)
+    restored = Run(tmp_path, name).restore(whole.state())
     task, settings = build_task(whole.configuration.task), whole.configuration.task
     actions = [
         evaluate(task, settings, one.learner.policy, 3, Streams(5)).episodes.actions
@@ -120,7 +69,7 @@ def test_what_is_no_number_ends_as_diverged(tmp_path, name):
         return task
 
     with pytest.raises(Diverged):
-        run(tmp_path, name, wrap=spoilt).iterate(1, 1)
+        Run(tmp_path, name, wrap=spoilt).iterate(1, 1)
 
 
 # What is planned with
@@ -128,14 +77,14 @@ def test_what_is_no_number_ends_as_diverged(tmp_path, name):
 
 def test_metrics_say_how_good_the_models_are(tmp_path):
     for name, costs in (("global-mpc", True), ("mpc-nn", False)):
-        metrics = run(tmp_path / name, name).iterate(1, 1).metrics[0]
+        metrics = Run(tmp_path / name, name).iterate(1, 1).metrics[0]
         assert {"one_step_r2", "horizon_r2"} <= set(metrics)
         assert ("cost_r2" in metrics) is costs
 
 
 def test_before_the_first_iteration_nothing_is_planned(tmp_path):
-    for name in TASKS:
-        one = run(tmp_path / name, name)
+    for name in ("global-mpc", "mpc-nn"):
+        one = Run(tmp_path / name, name)
         task = one.configuration.task
         judged = evaluate(build_task(task), task, one.learner.policy, 2, Streams(0))
         assert not judged.episodes.actions.any()
@@ -144,7 +93,7 @@ def test_before_the_first_iteration_nothing_is_planned(tmp_path):
 def test_a_bias_is_where_plans_begin(tmp_path):
     """With next to no deviation a plan stays there, over the bound of an action."""
     sets = ("planner.mean=[0.25, -0.5]", "planner.std=1e-9", "planner.least_std=0.0")
-    one = run(tmp_path, "global-mpc", *sets).iterate(1, 1)
+    one = Run(tmp_path, "global-mpc", *sets).iterate(1, 1)
     task = one.configuration.task
     judged = evaluate(build_task(task), task, one.learner.policy, 2, Streams(0))
     np.testing.assert_allclose(judged.episodes.actions[..., 0], 0.25 * task.action.bound, atol=1e-6)
@@ -153,12 +102,12 @@ def test_a_bias_is_where_plans_begin(tmp_path):
 
 def test_a_bias_of_another_length_is_refused(tmp_path):
     with pytest.raises(UsageError, match=r"planner\.mean = .*2 entries"):
-        run(tmp_path, "global-mpc", "planner.mean=[0.1]")
+        Run(tmp_path, "global-mpc", "planner.mean=[0.1]")
 
 
 def test_known_dynamics_are_driven_to_the_target(tmp_path):
     """Random shooting through a perfect model: the planner, apart from what is learned."""
-    one = run(tmp_path, "mpc-nn", "shooting.samples=256", "shooting.horizon=8").iterate(1, 1)
+    one = Run(tmp_path, "mpc-nn", "shooting.samples=256", "shooting.horizon=8").iterate(1, 1)
     learner, task = one.learner, one.configuration.task.model_copy(update={"horizon": 80})
     learner.task = task
     learner.model.dynamics.forward = car_dynamics

@@ -24,6 +24,9 @@ SMOOTHER = ('dynamics.posterior="smoother"', "dynamics.hidden=2")
         ("vae", FINE_TUNING, 3 + 2 + 2),
         ("rce", FINE_TUNING, 3 + 2 + 2),
         ("rce", ("training.attempts=2",), 2 * 3),
+        ("global-mpc", (), 3 + 3 * 3),
+        ("global-mpc", FINE_TUNING, 3 + 2 * 2 + 3 * 3),
+        ("mpc-nn", (), 3 * 3),
     ],
     ids=[
         "solar fine-tuned",
@@ -34,22 +37,30 @@ SMOOTHER = ('dynamics.posterior="smoother"', "dynamics.hidden=2")
         "vae fine-tuned",
         "rce fine-tuned",
         "rce frozen, two attempts",
+        "global-mpc",
+        "global-mpc fine-tuned",
+        "mpc-nn",
     ],
 )
 def test_a_run_interrupted_at_any_pulse_ends_with_the_same_bits(tmp_path, name, sets, pulses):
-    last, saved = 3, []
+    saved = []
     whole = Run(
         tmp_path,
         name,
         *sets,
         pulse=lambda *_: saved.append((whole.environment.iteration, whole.state())),
     )
-    whole.iterate(1, last)
+    whole.iterate(1, 3)
     assert len(saved) == pulses
     for iteration, state in saved:
-        resumed = Run(tmp_path, name, *sets).restore(state).iterate(iteration, last)
-        assert repr(resumed.metrics) == repr(whole.metrics[iteration - 1 :])
-        assert resumed.bits() == whole.bits()
+        goes_on(Run(tmp_path, name, *sets).restore(state), iteration, whole)
+
+
+def goes_on(resumed, iteration, whole):
+    """Resumed in an iteration, it ends as the run that was not interrupted."""
+    resumed.iterate(iteration, len(whole.metrics))
+    assert repr(resumed.metrics) == repr(whole.metrics[iteration - 1 :])
+    assert resumed.bits() == whole.bits()
 
 
 @pytest.mark.parametrize(
@@ -62,7 +73,7 @@ def test_a_run_interrupted_while_it_collects_ends_with_the_same_bits(
 ):
     """With episodes that judge, the third iteration is rejected: the best collects again."""
     sets = (*sets, f"batches.noise_free={noise_free}")
-    last, saved, more = 3, [], {2: -1.0, 3: 1e3} if noise_free else {}
+    saved, more = [], {2: -1.0, 3: 1e3} if noise_free else {}
 
     steps = count(1)
 
@@ -75,13 +86,27 @@ def test_a_run_interrupted_while_it_collects_ends_with_the_same_bits(
         return costing(iteration, costs)
 
     whole = Run(tmp_path, name, *sets, costs=halfway)
-    whole.iterate(1, last)
+    whole.iterate(1, 3)
     assert [iteration for iteration, _ in saved] == sorted([1, 2, 3] * (1 + bool(noise_free)))
     assert [metrics["rejected"] for metrics in whole.metrics] == [0.0, 0.0, float(noise_free > 0)]
     for iteration, state in saved:
-        resumed = Run(tmp_path, name, *sets, costs=costing).restore(state).iterate(iteration, last)
-        assert repr(resumed.metrics) == repr(whole.metrics[iteration - 1 :])
-        assert resumed.bits() == whole.bits()
+        goes_on(Run(tmp_path, name, *sets, costs=costing).restore(state), iteration, whole)
+
+
+@pytest.mark.parametrize("name", ["global-mpc", "mpc-nn", "random", "zero"])
+def test_a_run_without_local_control_can_be_interrupted_while_it_collects(tmp_path, name):
+    saved, steps = [], count(1)
+
+    def halfway(iteration, costs):
+        if next(steps) % 6 == 3:  # of the six steps of an episode
+            saved.append((iteration, whole.state()))
+        return costs
+
+    whole = Run(tmp_path, name, costs=halfway)
+    whole.iterate(1, 3)
+    assert [iteration for iteration, _ in saved] == [1, 2, 3]
+    for iteration, state in saved:
+        goes_on(Run(tmp_path, name).restore(state), iteration, whole)
 
 
 @pytest.mark.parametrize("name", ["solar", "vae", "rce", "lqr-flm"])

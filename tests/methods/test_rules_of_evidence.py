@@ -9,9 +9,6 @@ from solar_cli.episodes import evaluate
 from solar_cli.settings.registry import BUILT_IN
 from solar_cli.streams import Streams
 
-TASKS = {"mpc-nn": "car-states"}
-"""of methods that do not learn from images"""
-
 
 class Blind:
     """A task without a judge."""
@@ -50,7 +47,7 @@ SMOOTHER = 'dynamics={ posterior = "smoother", hidden = 2 }'
 def test_evaluating_never_once_or_ten_times_gives_the_same_policies(tmp_path, name, sets):
     found = set()
     for times in (0, 1, 10):
-        run = Run(tmp_path / str(times), name, *sets, task=TASKS.get(name, "nav"))
+        run = Run(tmp_path / str(times), name, *sets)
         task = run.configuration.task
         for iteration in (1, 2):
             run.iterate(iteration, iteration)
@@ -67,8 +64,7 @@ def test_evaluating_never_once_or_ten_times_gives_the_same_policies(tmp_path, na
 @pytest.mark.filterwarnings("ignore:ground truth is missing")
 @pytest.mark.parametrize("name", [entry.name for entry in BUILT_IN])
 def test_measures_are_out_of_a_learners_reach(tmp_path, name):
-    task = TASKS.get(name, "nav")
-    seeing = Run(tmp_path / "seeing", name, task=task).iterate(1, 2)
-    blind = Run(tmp_path / "blind", name, wrap=Blind, task=task).iterate(1, 2)
+    seeing = Run(tmp_path / "seeing", name).iterate(1, 2)
+    blind = Run(tmp_path / "blind", name, wrap=Blind).iterate(1, 2)
     assert repr(blind.metrics) == repr(seeing.metrics)
     assert digest(blind.state()["learner"]) == digest(seeing.state()["learner"])
