@@ -55,7 +55,10 @@ def command(
         str | None, typer.Option(metavar="L", help="Name of the variant that --set makes.")
     ] = None,
     budget: Annotated[
-        str, typer.Option(metavar="desk|full|N", help="Where to stop, in episodes.")
+        str,
+        typer.Option(
+            metavar="desk|full|N", help="Episodes to stop at, with the iteration that reaches them."
+        ),
     ] = "desk",
     workers: Annotated[
         int | None,
