@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial, reduce
-from itertools import product
+from itertools import groupby, product
 from typing import NamedTuple
 
 import torch
@@ -46,15 +46,15 @@ class Strengths(NamedTuple):
 
 
 class Increments(NamedTuple):
-    """p(u_{t+1} - u_t | x_t) = N(F x_t + f, Sigma)."""
+    """p(u_{t+1} - u_t | x_t) = N(F x_t + f, Sigma); leading axes k are of alternatives."""
 
-    F: Float[Tensor, "T d p"]
-    f: Float[Tensor, "T d"]
-    Sigma: Float[Tensor, "T d d"]
+    F: Float[Tensor, "*k T d p"]
+    f: Float[Tensor, "*k T d"]
+    Sigma: Float[Tensor, "*k T d d"]
 
 
 Fit = Callable[[Transitions], Increments]
-"""from samples to the dynamics of every time step"""
+"""from samples to the dynamics of every time step, or to alternatives of them"""
 
 
 class LocalDynamics(NamedTuple):
@@ -78,12 +78,9 @@ def infer_dynamics(
     fit: Fit
     if settings.method == "posterior":
         sources = _sources(samples, past, prior, settings)
-        grid = _grid(sources, settings)
-        scores = [_held_out(partial(_posterior, sources, s), samples, settings.folds) for s in grid]
-        best = max(range(len(grid)), key=lambda i: scores[i].log_likelihood)
-        fit = partial(_posterior, sources, grid[best])
-        score = scores[best]
-        metrics = {f"prior_{name}": value for name, value in grid[best]._asdict().items()}
+        best, score = _chosen(sources, samples, settings)
+        fit = partial(_posterior, sources, _reach(best), (best.model, best.older))
+        metrics = {f"prior_{name}": value for name, value in best._asdict().items()}
     else:
         fits: dict[str, Fit] = {
             "regression": _regression,
@@ -92,30 +89,32 @@ def infer_dynamics(
         }
         fit = fits[settings.method]
         score = _held_out(fit, samples, settings.folds)
-    metrics |= {"one_step_log_likelihood": score.log_likelihood, "one_step_r2": score.r2}
+    metrics["one_step_log_likelihood"] = float(score.log_likelihood)
+    metrics["one_step_r2"] = float(score.r2)
     return LocalDynamics(_whole(fit(samples), newest, prior), metrics)
 
 
 class _Score(NamedTuple):
-    """One-step prediction on folds that were left out of the fit."""
+    """One-step prediction on folds that were left out of the fit, of each alternative."""
 
-    log_likelihood: float
+    log_likelihood: Float[Tensor, "*k"]
     """nats a transition"""
-    r2: float
+    r2: Float[Tensor, "*k"]
     """share of the increments' variance that is predicted"""
 
 
 def _held_out(fit: Fit, samples: Transitions, folds: int) -> _Score:
     count = samples.live.shape[1]
     fold = torch.arange(count) % min(folds, count)
-    likelihood = squared = 0.0
+    likelihood = squared = samples.y.new_zeros(())
     for k in range(int(fold.max()) + 1):
         learned, judge = samples.of(fold != k), samples.of(fold == k)
         fitted = fit(learned)
-        residual = judge.y - judge.x @ fitted.F.mT - fitted.f.unsqueeze(1)
+        residual = judge.y - judge.x @ fitted.F.mT - fitted.f.unsqueeze(-2)
         spread = fitted.Sigma * (1 + 1 / learned.counts[:, None, None])
-        likelihood += float((_log_density(residual, spread) * judge.live).sum())
-        squared += float((residual.square() * judge.live.unsqueeze(-1)).sum())
+        likelihood = likelihood + (_log_density(residual, spread) * judge.live).sum(dim=(-2, -1))
+        wrong = residual.square().sum(dim=-1) * judge.live
+        squared = squared + wrong.sum(dim=(-2, -1))
     total = float(samples.live.sum())
     deviation = samples.y - samples.y.sum(dim=(0, 1)) / total
     spread_of_y = float((deviation.square() * samples.live.unsqueeze(-1)).sum())
@@ -180,11 +179,11 @@ def _centred_statistics(samples: Transitions) -> mniw.RegressionStatistics:
     return mniw.regression_statistics(samples.x - x_mean, samples.y - y_mean, weights=samples.live)
 
 
-def _neighbourhood(horizon: int, strengths: Strengths) -> Float[Tensor, "T T"]:
+def _neighbourhood(horizon: int, width: float, neighbours: float) -> Float[Tensor, "T T"]:
     """Weight of step s's samples in the fit at t: 1 for its own, less for its neighbours."""
     times = torch.arange(horizon, dtype=torch.float64)
     distance = times[:, None] - times
-    weight = strengths.neighbours * torch.exp(-0.5 * (distance / strengths.width).square())
+    weight = neighbours * torch.exp(-0.5 * (distance / width).square())
     weight.fill_diagonal_(1.0)
     return weight
 
@@ -194,13 +193,42 @@ def _pooled(own: mniw.RegressionStatistics, weight: Tensor) -> mniw.RegressionSt
     return mniw.RegressionStatistics(*(torch.einsum("ts,s...->t...", weight, part) for part in own))
 
 
-def _posterior(sources: _Sources, strengths: Strengths, samples: Transitions) -> Increments:
-    """The point estimate of every time step: appendix B is a sum in natural parameters."""
+def _chosen(
+    sources: _Sources, samples: Transitions, settings: LocalFit
+) -> tuple[Strengths, _Score]:
+    """The best of the grid. All pseudo-counts of one neighbourhood are judged at once."""
+    found: list[tuple[Strengths, _Score]] = []
+    for reach, group in groupby(sorted(_grid(sources, settings), key=_reach), key=_reach):
+        alike = list(group)
+        counts = [(one.model, one.older) for one in alike]
+        fits = partial(_posterior, sources, reach, counts)
+        scores = zip(*_held_out(fits, samples, settings.folds), strict=True)
+        found += [(one, _Score(*score)) for one, score in zip(alike, scores, strict=True)]
+    return max(found, key=lambda pair: float(pair[1].log_likelihood))
+
+
+def _reach(strengths: Strengths) -> tuple[float, float]:
+    return strengths.width, strengths.neighbours
+
+
+def _posterior(
+    sources: _Sources,
+    reach: tuple[float, float],
+    counts: Sequence[tuple[float, float]] | tuple[float, float],
+    samples: Transitions,
+) -> Increments:
+    """The point estimate of every time step: appendix B is a sum in natural parameters.
+
+    ``reach`` is width and weight of neighbours, ``counts`` the pseudo-counts of the model and of
+    older batches; several of them are the first axis of what is returned.
+    """
     own = _centred_statistics(samples)
-    natural = _pooled(own, _neighbourhood(len(own.n), strengths)).plus(sources.ridge)
-    for source, counts in ((sources.model, strengths.model), (sources.older, strengths.older)):
-        if source is not None and counts:
-            natural = natural.plus(source.scaled(counts))
+    natural = _pooled(own, _neighbourhood(len(own.n), *reach))
+    model, older = own.yy.new_tensor(counts).unbind(dim=-1)
+    weights = (torch.ones_like(model), model, older)
+    for source, weight in zip(sources, weights, strict=True):
+        if source is not None:
+            natural = natural.plus(source.scaled(weight.unsqueeze(-1)))
     F, Sigma = mniw.point_estimate(mniw.standard(natural))
     x_mean, y_mean = samples.means()
     f = y_mean[:, 0] - (F @ x_mean.mT).squeeze(-1)
@@ -211,7 +239,7 @@ def _increments(F: Tensor, f: Tensor, Sigma: Tensor, samples: Transitions) -> In
     """Bounded below, and held from the last time step that has a sample."""
     Sigma = Sigma + LEAST_VARIANCE * torch.eye(Sigma.shape[-1]).to(Sigma)
     times = torch.arange(len(samples.live)).clamp(max=samples.sampled - 1)
-    return Increments(F[times], f[times], Sigma[times])
+    return Increments(F[..., times, :, :], f[..., times, :], Sigma[..., times, :, :])
 
 
 def _grid(sources: _Sources, settings: LocalFit) -> list[Strengths]:
@@ -227,12 +255,12 @@ def _grid(sources: _Sources, settings: LocalFit) -> list[Strengths]:
 
 
 def _log_density(
-    residual: Float[Tensor, "T n d"], Sigma: Float[Tensor, "T d d"]
-) -> Float[Tensor, "T n"]:
+    residual: Float[Tensor, "*k n d"], Sigma: Float[Tensor, "*k d d"]
+) -> Float[Tensor, "*k n"]:
     """log N(residual | 0, Sigma)."""
     factor = torch.linalg.cholesky(Sigma)
     white = torch.linalg.solve_triangular(factor, residual.mT, upper=False)
-    log_determinant = cholesky.log_determinant(factor)[:, None]
+    log_determinant = cholesky.log_determinant(factor).unsqueeze(-1)
     constant = residual.shape[-1] * math.log(2 * math.pi)
     density: Tensor = -0.5 * (white.square().sum(dim=-2) + log_determinant + constant)
     return density

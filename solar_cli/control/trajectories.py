@@ -69,7 +69,7 @@ class Trajectories(NamedTuple):
         """Episodes whose every action had noise; without it an action is its mean, or clipped."""
         return ((self.actions != self.action_means).any(dim=-1) | ~self.live).all(dim=1)
 
-    def only(self, episodes: Bool[Tensor, " N"]) -> Trajectories:
+    def only(self, episodes: Bool[Tensor, " N"] | slice) -> Trajectories:
         """Some of the episodes."""
         return Trajectories(*(part[episodes] for part in self))
 

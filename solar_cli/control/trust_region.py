@@ -76,8 +76,8 @@ class TrustRegion:
     """fall of the cost that the last update predicted"""
     kept: float = math.nan
     """fall of the cost that was measured for it"""
-    rejections: int = 0
-    """last policies in a row that were worse than the best, and taken back"""
+    rejected: tuple[Batch, ...] = ()
+    """of the last policies in a row that were worse than the best and taken back, one of each"""
     first: float = math.nan
     """cost of the first policy, which knows nothing"""
 
@@ -88,8 +88,8 @@ class TrustRegion:
         kept = self.current.cost - tried.cost
         if tolerance != "never" and tried.cost > self.best.cost + self._margin(tried, tolerance):
             step = self.step.after_rejection()
-            again = self.rejections + 1
-            return replace(self, current=self.best, step=step, kept=kept, rejections=again)
+            rejected = (*self.rejected, *tried.batches)
+            return replace(self, current=self.best, step=step, kept=kept, rejected=rejected)
         step = self.step.after(self.promised, kept)
         if self.promised < self._share(LEFT_TO_GAIN):
             step = min(step, self.step, key=lambda step: step.multiplier)
@@ -99,7 +99,7 @@ class TrustRegion:
             best=tried if tried.cost < self.best.cost else self.best,
             current=tried,
             kept=kept,
-            rejections=0,
+            rejected=(),
         )
 
     def _margin(self, tried: Anchor, tolerance: float) -> float:
@@ -109,8 +109,13 @@ class TrustRegion:
         the margin, or a lucky batch would be built upon for ever (car, seed 102: five in a row).
         """
         assert self.best is not None
-        noise = tolerance * (1 + self.rejections) * math.hypot(tried.error, self.best.error)
-        return max(noise, self._share(NEXT_TO_NOTHING))
+        noise = tolerance * math.hypot(tried.error, self.best.error)
+        return (1 + self.rejections) * max(noise, self._share(NEXT_TO_NOTHING))
+
+    @property
+    def rejections(self) -> int:
+        """Policies in a row that were taken back."""
+        return len(self.rejected)
 
     @property
     def built_upon(self) -> Anchor:
@@ -154,7 +159,7 @@ class TrustRegion:
             "current": _plain(self.current),
             "promised": self.promised,
             "first": self.first,
-            "rejections": self.rejections,
+            "rejected": [tuple(batch) for batch in self.rejected],
         }
 
     def restored(self, state: dict[str, Any]) -> TrustRegion:
@@ -166,7 +171,8 @@ class TrustRegion:
             current=_anchor(state["current"]),
             promised=state["promised"],
             first=state["first"],
-            rejections=state["rejections"],
+            # Checkpoints from before they were learned from have none.
+            rejected=tuple(Batch(*batch) for batch in state.get("rejected", ())),
         )
 
 

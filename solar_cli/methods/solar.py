@@ -26,19 +26,19 @@ class Solar(LocalLearner):
     def iterate(self, experience: Experience) -> dict[str, float]:
         """One turn of Algorithm 1 (lines 4 to 8)."""
         region = self.collect_and_judge(experience)  # line 4: of the newest, or the best
-        batches, older = self.to_learn_from(experience, region)
+        lesson = self.to_learn_from(experience, region)
 
         model = self.representation.update(experience)  # line 5: MODELUPDATE, section 3
-        states, older_states = self.embedded(batches, older)
+        states = self.embedded(lesson)
 
-        previous = self.linearised(region, states)  # line 6: LINEARIZEPOLICY, appendix C
+        previous = self.linearised(region, states.own)  # line 6: LINEARIZEPOLICY, appendix C
         dynamics = self.infer_dynamics(  # line 7: INFERDYNAMICS, section 4.1 and appendix B
-            states,
-            older_states,
-            self.latent_prior(older),
+            states.newest,
+            states.older,
+            self.latent_prior(lesson),
             self.streams.under("local dynamics", experience.iteration),
         )
-        cost = self.fitted_cost(states, older_states)  # the quadratic cost of section 3
+        cost = self.fitted_cost(states.newest, states.older)  # the quadratic cost of section 3
         bound = self.max_kl(region, len(dynamics.model.F))
         update = improve_policy(  # line 8: POLICYUPDATE, section 4.2 and appendix A
             previous.policy, dynamics.model, cost.model, bound, self.std_bounds()
@@ -47,9 +47,9 @@ class Solar(LocalLearner):
             **model,
             **dynamics.metrics,
             **cost.metrics,
-            **self.checked(states, older_states),
+            **self.checked(states.own, states.older),
             "linearisation_residual": previous.residual,
             **self.adopt(
-                region, previous.policy, update, (dynamics.model, cost.model), states.reached
+                region, previous.policy, update, (dynamics.model, cost.model), states.own.reached
             ),
         }

@@ -26,6 +26,7 @@ EXTRAS = (
     Extra("whitening of states", "whitening", off=False),
     Extra("restarts of dead representations", "training.attempts", off=1),
     Extra("going back to the best policy", "update.reject", off="never"),
+    Extra("learning from what was taken back", "update.rejected_batches", 0, "update.reject"),
     Extra("bounds of the policy's noise", "update.std_floor", off=None),
     Extra("judging by episodes without noise", "batches.noise_free", 0, "update.reject"),
 )

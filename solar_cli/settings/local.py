@@ -178,11 +178,12 @@ class NetworkFit(LocalFit):
 class CostFit(Settings):
     """c_t = 1/2 z^T L L^T z + c^T z + alpha |a|^2 + b (section 3)."""
 
-    optimiser: Literal["lbfgs", "sgd"] = setting(
-        "lbfgs", "of the squared error; sgd is full-batch descent with momentum"
+    optimiser: Literal["convex", "sgd"] = setting(
+        "convex",
+        "least squares with C >= 0; sgd: full-batch descent on L, of the fit for all time steps",
     )
     ridge: tuple[float, ...] = setting(
-        (0.0, 0.03, 0.3),
+        (1e-6, 1e-4, 1e-2, 0.1, 1.0),
         "weight of squared coefficients, in standardised units, chosen by held-out R2",
         min_length=1,
         added=[0.0],
@@ -210,6 +211,12 @@ class PolicyUpdate(Settings):
     linearise: bool = setting(True, "line 6 of Algorithm 1, when e(s) has changed")
     reject: Annotated[float, Field(ge=0)] | Literal["never"] = setting(
         1.0, "standard errors by which a batch may be worse than the best before going back"
+    )
+    rejected_batches: int = setting(
+        2,
+        "batches of policies that were taken back since, the last ones, that are learned from too",
+        ge=0,
+        added=0,
     )
     std_floor: tuple[Positive, Positive] = setting(
         (0.67, 0.33), "least std over the initial one: first updates, later ones"

@@ -174,9 +174,8 @@ def test_a_cost_is_recovered_from_live_steps(per_time):
     assert found.r2 > 0.999
     assert r2(found.model, states) > 0.999
     for t in range(T):
-        # L-BFGS stops at a squared error of some 1e-7 of the costs' variance.
-        np.testing.assert_allclose(found.model.C[t, :d, :d], CURVED, atol=0.02)
-        np.testing.assert_allclose(found.model.b[t], 4.0, atol=0.02)
+        np.testing.assert_allclose(found.model.C[t, :d, :d], CURVED, atol=1e-3)
+        np.testing.assert_allclose(found.model.b[t], 4.0, atol=1e-3)
 
 
 def test_a_cost_far_from_all_live_steps_is_the_one_shared_by_all():
@@ -190,7 +189,7 @@ def test_a_cost_far_from_all_live_steps_is_the_one_shared_by_all():
         fit_quadratic_cost(states, [], 0.0, CostFit(per_time=per_time, width=0.5), d).model
         for per_time in ("chosen", "never")
     )
-    for t, curvature in ((0, 2.2), (2, 5.8)):  # a neighbour weighs 0.14; L-BFGS stops early
+    for t, curvature in ((0, 2.2), (2, 5.8)):  # a neighbour weighs 0.14, and all pull
         assert float(found.C[t, 0, 0]) == pytest.approx(curvature, rel=0.2)
     for t in (10, 99):
         torch.testing.assert_close(found.C[t], shared.C[t], rtol=1e-12, atol=1e-12)

@@ -5,7 +5,7 @@ import pytest
 import torch
 from predicted_costs import r2
 
-from solar_cli.control.quadratic_cost import FOLDS, fit_quadratic_cost
+from solar_cli.control.quadratic_cost import FOLDS, PULL, fit_quadratic_cost
 from solar_cli.control.trajectories import Trajectories
 from solar_cli.settings.local import CostFit
 
@@ -53,6 +53,23 @@ def curvature(w):
     return half + half.T
 
 
+# |C|^2 / 2 + |c|^2 in weights of monomials: C_ii = 2 w_ii, and C_ij = w_ij stands in C twice.
+PENALTY = np.array([*np.where(np.equal(*np.tril_indices(m)), 2.0, 1.0), *np.ones(m), 0.0])
+
+
+def standardised(states):
+    """Costs (N, T) without the action's part, their mean and std."""
+    known = states.costs.numpy() - ALPHA * np.square(states.actions.numpy()).sum(axis=-1)
+    mean, scale = known.mean(), known.std(ddof=1)
+    return (known - mean) / scale, mean, scale
+
+
+def regression(design, y, penalty, towards):
+    """w of the least mean squared error + penalty (w - towards)^2."""
+    left = design.T @ design / len(design) + np.diag(penalty)
+    return np.linalg.solve(left, design.T @ y / len(design) + penalty * towards)
+
+
 # What is known is found
 
 
@@ -62,10 +79,10 @@ def test_a_known_quadratic_is_recovered(per_time):
     assert found.r2 > 0.999
     assert r2(found.model, batch(quadratic, seed=1)) > 0.999
     for t in range(T):
-        # L-BFGS stops at a squared error of some 1e-7 of the costs' variance.
-        np.testing.assert_allclose(found.model.C[t, :m, :m], C, atol=0.02)
-        np.testing.assert_allclose(found.model.c[t, :m], c, atol=0.02)
-        np.testing.assert_allclose(found.model.b[t], b, atol=0.02)
+        # The least ridge that is chosen among is 1e-6, and moves what is found by as much.
+        np.testing.assert_allclose(found.model.C[t, :m, :m], C, atol=1e-4)
+        np.testing.assert_allclose(found.model.c[t, :m], c, atol=1e-4)
+        np.testing.assert_allclose(found.model.b[t], b, atol=1e-4)
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e6])
@@ -75,11 +92,10 @@ def test_units_of_cost_do_not_matter(scale, offset):
     pure = states._replace(costs=states.costs - ALPHA * states.actions.square().sum(dim=-1))
     one = fit(pure, alpha=0.0, per_time="never")
     other = fit(pure._replace(costs=scale * (pure.costs + offset)), alpha=0.0, per_time="never")
-    # Rounding steers the line search, so the fits agree as far as both have converged.
-    np.testing.assert_allclose(other.model.C / scale, one.model.C, atol=0.02)
-    np.testing.assert_allclose(other.model.c / scale, one.model.c, atol=0.02)
-    np.testing.assert_allclose(other.model.b[0] / scale, one.model.b[0] + offset, atol=0.02)
-    assert other.r2 == pytest.approx(one.r2, abs=1e-3)
+    np.testing.assert_allclose(other.model.C / scale, one.model.C, atol=1e-6)
+    np.testing.assert_allclose(other.model.c / scale, one.model.c, atol=1e-6)
+    np.testing.assert_allclose(other.model.b[0] / scale, one.model.b[0] + offset, atol=1e-6)
+    assert other.r2 == pytest.approx(one.r2, abs=1e-9)
 
 
 def test_the_actions_part_is_known_exactly():
@@ -157,7 +173,7 @@ def test_r2_is_that_of_episodes_left_out():
         squared += np.square(rows(design[judge]) @ w - known[judge].ravel()).sum()
     expected = 1 - squared / np.square(known - known.mean()).sum()
     assert 0.1 < expected < 0.8
-    assert fit(states, per_time="never", ridge=(0.0,)).r2 == pytest.approx(expected, abs=0.01)
+    assert fit(states, per_time="never", ridge=(0.0,)).r2 == pytest.approx(expected, abs=1e-6)
 
 
 def varying(z, t):
@@ -236,23 +252,25 @@ def test_a_good_representation_is_not_taken_for_a_dead_one(seed):
 
 
 def test_a_fit_per_time_step_is_a_weighted_regression_on_monomials():
-    """Where that is positive definite; samples of neighbouring steps weigh as a Gaussian."""
+    """Of standardised costs, pulled to the regression on all time steps; samples of neighbouring
+    steps weigh as a Gaussian. Where that is convex, it is what is found.
+    """
     width, states = 1.3, batch(varying, episodes=200, noise=0.3)
-    known = states.costs.numpy() - ALPHA * np.square(states.actions.numpy()).sum(axis=-1)
+    y, mean, scale = standardised(states)
     design = monomials(states)
-    found = fit(states, width=width)
+    shared = regression(rows(design), y.ravel(), 1e-6 * PENALTY, np.zeros(len(PENALTY)))
+    found = fit(states, width=width, ridge=(1e-6,))
     assert found.choice.per_time
     for t in range(T):
         distance = np.abs(np.arange(T) - t)
-        root = np.exp(-0.25 * np.square(distance / width)) * (distance <= 3)
-        left = rows(root[:, None] * design)
-        w = np.linalg.lstsq(left, (root * known).ravel(), rcond=None)[0]
-        expected = curvature(w)
-        assert np.linalg.eigvalsh(expected).min() > 0.05
-        # The pull towards the one fit of all time steps moves it by a little.
-        np.testing.assert_allclose(found.model.C[t, :m, :m], expected, atol=0.04)
-        np.testing.assert_allclose(found.model.c[t, :m], w[-m - 1 : -1], atol=0.04)
-        np.testing.assert_allclose(found.model.b[t], w[-1], atol=0.04)
+        weight = np.exp(-0.5 * np.square(distance / width)) * (distance <= 3)
+        root = np.sqrt(weight / weight.sum() * T)
+        pull = PULL * np.maximum(PENALTY, 1)
+        w = regression(rows(root[:, None] * design), (root * y).ravel(), pull, shared)
+        assert np.linalg.eigvalsh(curvature(w)).min() > 0.02
+        np.testing.assert_allclose(found.model.C[t, :m, :m], scale * curvature(w), atol=1e-6)
+        np.testing.assert_allclose(found.model.c[t, :m], scale * w[-m - 1 : -1], atol=1e-6)
+        np.testing.assert_allclose(found.model.b[t], scale * w[-1] + mean, atol=1e-6)
 
 
 def flat(z, t):
@@ -290,17 +308,10 @@ def test_older_batches_of_another_cost_are_left_alone():
 
 
 def test_a_ridge_is_that_of_the_closed_form():
-    """In standardised costs; scikit-learn's weighting of w^T R w / n by hand, pure curvature."""
     ridge, states = 0.3, batch(quadratic, episodes=100)
-    known = states.costs.numpy() - ALPHA * np.square(states.actions.numpy()).sum(axis=-1)
-    y = (known - known.mean()) / known.std(ddof=1)
-    design = rows(monomials(states))
-    i, j = np.tril_indices(m)
-    # |C|^2 / 2 + |c|^2 in weights: C_ii = 2 w_ii, and C_ij = w_ij stands in C twice.
-    penalty = np.diag([*np.where(i == j, 2.0, 1.0), *np.ones(m), 0.0])
-    left = design.T @ design / len(design) + ridge * penalty
-    w = np.linalg.solve(left, design.T @ y.ravel() / len(design)) * known.std(ddof=1)
-    assert np.linalg.eigvalsh(curvature(w)).min() > 0.02
+    y, _, scale = standardised(states)
+    w = regression(rows(monomials(states)), y.ravel(), ridge * PENALTY, np.zeros(len(PENALTY)))
+    assert np.linalg.eigvalsh(curvature(w)).min() > 0.01
     found = fit(states, per_time="never", ridge=(ridge,)).model
-    np.testing.assert_allclose(found.C[0, :m, :m], curvature(w), atol=0.02)
-    np.testing.assert_allclose(found.c[0, :m], w[-m - 1 : -1], atol=0.02)
+    np.testing.assert_allclose(found.C[0, :m, :m], scale * curvature(w), atol=1e-8)
+    np.testing.assert_allclose(found.c[0, :m], scale * w[-m - 1 : -1], atol=1e-8)

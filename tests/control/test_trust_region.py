@@ -117,6 +117,15 @@ def test_each_rejection_in_a_row_widens_the_margin():
     assert after(10.0, 15.0, 15.0, 14.3).rejections == 3
     assert after(10.0, 15.0, 15.0, 14.2).current == tried(4, 14.2)
     assert after(10.0, 15.0, 12.8, 11.5).rejections == 1
+    # Where there is no noise, next to nothing widens as well.
+    assert after(100.0, 60.0, 60.9, 61.7, error=1e-3).rejections == 2
+    assert after(100.0, 60.0, 60.9, 61.5, error=1e-3).rejections == 0
+
+
+def test_episodes_of_policies_that_were_taken_back_in_a_row_are_known():
+    state = after(10.0, 9.0, 15.0, 15.0)
+    assert state.rejected == (*tried(3, 15.0).batches, *tried(4, 15.0).batches)
+    assert after(10.0, 9.0, 15.0, 8.0).rejected == ()
 
 
 def test_without_rejection_anything_is_built_upon():
@@ -246,7 +255,7 @@ def test_a_saved_trust_region_goes_on_as_it_would_have(costs):
     restored = region().restored(torch.load(buffer, weights_only=True))
     for cost in (9.0, 12.0, 30.0):
         left, right = (s.judged(tried(7, cost), 1.0) for s in (state, restored))
-        for name in ("step", "kept", "rejections", "promised", "first"):
+        for name in ("step", "kept", "rejected", "promised", "first"):
             assert str(getattr(left, name)) == str(getattr(right, name)), name
         for name in ("best", "current"):
             one, other = getattr(left, name), getattr(right, name)

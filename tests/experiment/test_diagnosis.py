@@ -24,6 +24,7 @@ from solar_cli.experiment.diagnosis import ALL, AS_IT_IS, diagnose, local_learne
 from solar_cli.experiment.privileged import ROLLOUTS, Part, World, of_positions, seen_whole
 from solar_cli.experiment.session import Session
 from solar_cli.methods import local, solar
+from solar_cli.methods.local import Lesson
 from solar_cli.settings import Cell, cells, load, load_card, method, method_names
 from solar_cli.settings.local import CostFit
 from solar_cli.settings.registry import BUILT_IN, settings_class
@@ -34,14 +35,10 @@ from solar_cli.streams import Streams
 pytestmark = pytest.mark.filterwarnings("ignore:no representation of")
 SMALL = ("training.steps=12", 'cost_fit.per_time="never"', "batches={ initial = 8, noisy = 6 }")
 LOCAL = [e.name for e in BUILT_IN if issubclass(load(e.learner), local.LocalLearner)]
-ROUNDS = quadratic_cost.LBFGS_ROUNDS
 
 
 @pytest.fixture(autouse=True)
-def as_in_a_worker(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """With cost fits that fit into a test, where a test does not need good ones."""
-    monkeypatch.setattr(quadratic_cost, "LBFGS_ROUNDS", 10)
-    monkeypatch.setattr(quadratic_cost, "COMPARED_ROUNDS", 10)
+def as_in_a_worker() -> Iterator[None]:
     torch.use_deterministic_algorithms(True)
     yield
     torch.use_deterministic_algorithms(False)
@@ -105,7 +102,8 @@ class Watched:
         """Other episodes of the policy that collected the last batch, as control sees them."""
         policy = self.learner._tried[self.environment.iteration]
         world = World(self.world.task, self.task, Streams(1))
-        return self.learner.embedded([World.roll_out(world, policy, episodes, 0)], [])[0]
+        rolled_out = World.roll_out(world, policy, episodes, 0)
+        return self.learner.embedded(Lesson([rolled_out], [], [])).own
 
 
 def test_as_it_is_gives_the_number_that_a_worker_stores(store: Store) -> None:
@@ -168,10 +166,9 @@ def test_dynamics_are_plain_regression_on_the_observers_rollouts(
         slopes = np.linalg.lstsq(design, z[:, t + 1], rcond=None)[0].T
         np.testing.assert_allclose(dynamics.F[t].numpy(), slopes[:, :-1], rtol=1e-6, atol=1e-8)
         np.testing.assert_allclose(dynamics.f[t].numpy(), slopes[:, -1], rtol=1e-6, atol=1e-8)
-    batch, older = run.learner.embedded(
-        [collected_in(2, run.environment)], [[collected_in(1, run.environment)]]
-    )
-    own = local.LocalLearner.fitted_cost(run.learner, batch, older).model
+    first, second = (collected_in(iteration, run.environment) for iteration in (1, 2))
+    states = run.learner.embedded(Lesson([second], [], [[first]]))
+    own = local.LocalLearner.fitted_cost(run.learner, states.newest, states.older).model
     assert torch.equal(cost.C, own.C)  # of the counted batch
 
 
@@ -180,15 +177,15 @@ def test_the_cost_is_fitted_on_the_observers_rollouts(
 ) -> None:
     run = Watched(tmp_path, monkeypatch, small(), Part.COST).iterate(2)
     _, dynamics, cost, *_ = run.updates[-1]
-    rollouts, _ = run.learner.embedded(run.observed, [])
+    rollouts = run.learner.embedded(Lesson(run.observed, [], [])).own
     settings = CostFit(width=privileged.OWN_STEP, terminal=3.0)
     again = quadratic_cost.fit_quadratic_cost(rollouts, [], 0.001, settings, 4).model
     assert torch.equal(cost.C, again.C)
-    older = [collected_in(1, run.environment)]
-    batches = [collected_in(2, run.environment), older[0]]
-    states = [run.learner.embedded([batch], [])[0] for batch in batches]
+    first, second = (collected_in(iteration, run.environment) for iteration in (1, 2))
+    lesson = Lesson([second], [], [[first]])
+    states = run.learner.embedded(lesson)
     own = local.LocalLearner.infer_dynamics(
-        run.learner, states[0], states[1:], run.learner.latent_prior([older]), run.streams
+        run.learner, states.newest, states.older, run.learner.latent_prior(lesson), run.streams
     )
     assert torch.equal(dynamics.F, own.model.F)  # of the counted batches
 
@@ -204,8 +201,7 @@ def test_representations_are_judged_by_the_methods_own_cost(
     assert found[0] == found[1]
 
 
-def test_a_fit_of_its_own_step_knows_nothing_of_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(quadratic_cost, "LBFGS_ROUNDS", ROUNDS)
+def test_a_fit_of_its_own_step_knows_nothing_of_the_next() -> None:
     stream = np.random.default_rng(0)
     z = torch.as_tensor(stream.normal(size=(200, 5, 2)))
     factor = torch.tensor([1.0, 10.0, 1.0, 10.0], dtype=torch.float64)
@@ -263,7 +259,6 @@ def test_with_everything_known_the_model_is_the_simulator(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Navigation is linear and its cost quadratic, so that both fits have a closed form."""
-    monkeypatch.setattr(quadratic_cost, "LBFGS_ROUNDS", ROUNDS)
     run = Watched(tmp_path, monkeypatch, small(), *Part).iterate(2)
     _, dynamics, cost, *_ = run.updates[-1]
     states = run.fresh(50)

@@ -114,7 +114,6 @@ def test_moments_of_the_cost_fit_are_those_that_it_holds(
         return {quadratic_cost.Choice(0.0, 0.0, per_time=False): 1.0}
 
     monkeypatch.setattr(quadratic_cost, "_held_out", looked_at)
-    monkeypatch.setattr(quadratic_cost, "LBFGS_ROUNDS", 1)
     states = Trajectories(z, actions, actions, costs, costs > -1)
     quadratic_cost.fit_quadratic_cost(states, [], 0.0, CostFit(), latents)
     [need] = [need for need in memory_needs(cell) if need.what == "moments of the cost fit"]

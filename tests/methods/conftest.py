@@ -1,10 +1,9 @@
-"""Methods are tested as a worker runs them, with pulses and cost fits that fit into a test."""
+"""Methods are tested as a worker runs them, with pulses that fit into a test."""
 
 from pathlib import Path
 
 import pytest
 
-from solar_cli.control import quadratic_cost
 from solar_cli.models import neural_fit, training
 
 
@@ -21,5 +20,3 @@ def as_in_a_worker(worker_torch: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """For every test here, with short steps."""
     monkeypatch.setattr(training, "PULSE_STEPS", 4)
     monkeypatch.setattr(neural_fit, "JUDGED_STEPS", 4)
-    monkeypatch.setattr(quadratic_cost, "LBFGS_ROUNDS", 10)
-    monkeypatch.setattr(quadratic_cost, "COMPARED_ROUNDS", 10)

@@ -8,6 +8,7 @@ from collected_episodes import collected_in
 from method_runs import Run
 
 from solar_cli.methods import solar
+from solar_cli.methods.local import Lesson
 
 both = pytest.mark.parametrize("name", ["solar", "vae", "rce"])
 every = pytest.mark.parametrize("name", ["solar", "vae", "rce", "lqr-flm"])
@@ -83,6 +84,19 @@ def test_an_update_is_planned_for_what_was_lived(tmp_path, monkeypatch):
     for part, known in zip(gains, planned, strict=True):
         assert torch.equal(part[:reached], known[:reached])
         assert all(torch.equal(later, known[reached - 1]) for later in part[reached:])
+
+
+def test_states_reach_as_far_as_the_policy_that_is_built_upon(tmp_path):
+    """Longer episodes of one that was taken back say nothing of what follows its own."""
+    done = run(tmp_path, "solar")
+    episodes = collected_in(1, done.environment)
+    short, long = (episodes[np.isin(episodes.lengths, some)] for some in ((2, 3), (5, 6)))
+    assert min(len(short), len(long)) > 1
+    own, newest, older = done.learner.embedded(Lesson([short], [long], [[long]]))
+    assert len(own.z) == len(short)
+    assert len(newest.z) == len(short) + len(long)
+    steps = int(np.sort(short.lengths)[-2])
+    assert {part.live.shape[1] for part in (own, newest, *older)} == {steps}
 
 
 @both

@@ -9,6 +9,7 @@ from method_runs import Run
 from solar_cli.episodes import Batch, window_indices
 from solar_cli.experience import Experience
 from solar_cli.methods import solar
+from solar_cli.methods.local import Lesson
 from solar_cli.models.representation import Representation
 
 EPISODES = "batches={ initial = 16, noisy = 16 }"
@@ -42,7 +43,7 @@ def before_the_update(tmp_path, linearise: str):
     run.environment.begin(3)
     experience = Experience(run.environment)
     region = run.learner.collect_and_judge(experience)
-    [batch] = run.learner.to_learn_from(experience, region)[0]
+    [batch] = run.learner.to_learn_from(experience, region).own
     return run, region, batch
 
 
@@ -72,7 +73,7 @@ def test_a_changed_head_is_undone_by_line_six_alone(tmp_path, linearise, preserv
         head.bias.copy_(mixing @ head.bias + 0.1)
     run.learner.representation.moved_in = 3
     assert change(run, episodes) > 0.3
-    states, _ = run.learner.embedded([episodes], [])
+    states = run.learner.embedded(Lesson([episodes], [], [])).own
     run.learner.handed = run.learner.linearised(region, states).policy
     # The new latents are an affine map of the old ones, which a linear policy can undo.
     assert (change(run, episodes) < 0.01) == preserved
@@ -111,7 +112,8 @@ def test_a_frozen_encoder_leaves_the_policy_as_it_is(tmp_path):
     run, region, episodes = before_the_update(tmp_path, "true")
     run.learner.representation.update(Experience(run.environment))
     assert run.learner.representation.moved_in == 1
-    previous = run.learner.linearised(region, run.learner.embedded([episodes], [])[0])
+    own = run.learner.embedded(Lesson([episodes], [], [])).own
+    previous = run.learner.linearised(region, own)
     for left, right in zip(previous.policy, run.learner.gains, strict=True):
         assert torch.equal(left, right)
 

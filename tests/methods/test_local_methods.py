@@ -13,6 +13,7 @@ from solar_cli.envs import build_task
 from solar_cli.episodes import Batch, Episodes, Evaluation, evaluate
 from solar_cli.experience import Experience
 from solar_cli.methods import Diverged, local, solar
+from solar_cli.methods.local import Lesson
 from solar_cli.streams import Streams
 
 both = pytest.mark.parametrize("name", ["solar", "vae", "rce"])
@@ -57,7 +58,7 @@ def test_an_update_that_promises_little_is_tried_before_it_is_handed_over(
         assert torch.equal(handed, part)
     run.environment.begin(3)
     run.learner.collect_and_judge(Experience(run.environment))
-    z, _ = run.learner.embedded([collected_in(3, run.environment)], [])
+    z = run.learner.embedded(Lesson([collected_in(3, run.environment)], [], [])).own
     means = torch.einsum("tij,ntj->nti", newest.K, z.z[:, :-1]) + newest.k
     torch.testing.assert_close(z.action_means, means)  # the newest is what is tried
 
@@ -111,7 +112,7 @@ def test_a_noise_free_batch_judges_the_policy(tmp_path):
 # Going back to the best
 
 
-def test_a_rejected_batch_goes_back_to_the_best_policy_and_its_data(tmp_path, monkeypatch):
+def test_a_rejected_batch_goes_back_to_the_best_policy_and_is_learned_from(tmp_path, monkeypatch):
     dynamics, update = spied(monkeypatch, "infer_dynamics"), spied(monkeypatch, "improve_policy")
     run = Run(tmp_path, "solar", costs=of_iteration(2, lambda costs: costs + 1e3)).iterate(1, 2)
     metrics, region = run.metrics[1], run.learner.trust_region
@@ -121,8 +122,8 @@ def test_a_rejected_batch_goes_back_to_the_best_policy_and_its_data(tmp_path, mo
     assert metrics["step_multiplier"] < run.metrics[0]["step_multiplier"]
     first, second = (collected_in(i, run.environment) for i in (1, 2))
     newest, older = dynamics[1][:2]
-    np.testing.assert_array_equal(newest.costs, first.costs)
-    np.testing.assert_array_equal(older[0].costs, second.costs)
+    np.testing.assert_array_equal(newest.costs, Episodes.joined([first, second]).costs)
+    assert not older
     for left, right in zip(update[1][0], update[0][0], strict=True):
         assert torch.equal(left, right)  # the policy that collected the first batch
     run.iterate(3, 3)
@@ -143,21 +144,23 @@ def test_where_episodes_without_noise_reject_a_policy_the_best_collects_again(
     best = run.learner.trust_region.best.gains
     for iteration in (3, 4):
         again = batch(Batch(iteration, 1))
-        z, _ = run.learner.embedded([again], [])
+        z = run.learner.embedded(Lesson([again], [], [])).own
         means = torch.einsum("tij,ntj->nti", best.K, z.z[:, :-1]) + best.k
         torch.testing.assert_close(z.action_means, means)
         assert not np.allclose(batch(quiet(iteration)).action_means, again.action_means[:3])
-    of_the_best, older = dynamics[3][:2]
-    expected = batch(quiet(2), Batch(2, 1), Batch(3, 1), Batch(4, 1))
-    np.testing.assert_array_equal(of_the_best.actions, expected.actions)
-    # What is left of a rejected iteration has no noise, and says nothing of what actions do.
+    learned_from, older = dynamics[3][:2]
+    of_the_best = (quiet(2), Batch(2, 1), Batch(3, 1), Batch(4, 1))
+    expected = batch(*of_the_best, quiet(3), quiet(4))
+    np.testing.assert_array_equal(learned_from.actions, expected.actions)
     np.testing.assert_array_equal(older[0].actions, batch(quiet(1), Batch(1, 1)).actions)
     assert len(older) == 1
     assert run.learner.trust_region.best.cost == batch(quiet(2)).costs.sum(axis=1).mean()
     run.iterate(5, 6)
-    of_the_best, older = dynamics[5][:2]  # the last four of it
-    expected = batch(*(Batch(iteration, 1) for iteration in (3, 4, 5, 6)))
-    np.testing.assert_array_equal(of_the_best.actions, expected.actions)
+    learned_from, older = dynamics[5][:2]  # the last four of the best, and two that were rejected
+    of_the_best = (Batch(iteration, 1) for iteration in (3, 4, 5, 6))
+    expected = batch(*of_the_best, quiet(5), quiet(6))
+    np.testing.assert_array_equal(learned_from.actions, expected.actions)
+    # What is left of iterations 3 and 4 has no noise, and says nothing of what actions do.
     np.testing.assert_array_equal(older[0].actions, batch(quiet(2), Batch(2, 1)).actions)
     run.iterate(7, 7)
     assert run.learner.trust_region.current.batches == (quiet(7), Batch(7, 1))
@@ -300,11 +303,11 @@ def test_checks_of_the_task_are_stored_and_change_nothing(tmp_path, monkeypatch,
 
 def test_what_is_built_upon_and_older_batches_are_checked(tmp_path, monkeypatch):
     calls = spied(monkeypatch, "task_metrics")
-    run = Run(tmp_path, "solar", costs=of_iteration(2, lambda costs: costs + 1e3)).iterate(1, 2)
+    run = Run(tmp_path, "solar", costs=of_iteration(2, lambda costs: costs - 1e3)).iterate(1, 2)
     newest, older, *rest = calls[1]
-    first, rejected = (collected_in(i, run.environment) for i in (1, 2))
-    np.testing.assert_array_equal(newest.costs, first.costs)
-    np.testing.assert_array_equal(older[0].costs, rejected.costs)
+    first, second = (collected_in(i, run.environment) for i in (1, 2))
+    np.testing.assert_array_equal(newest.costs, second.costs)
+    np.testing.assert_array_equal(older[0].costs, first.costs)
     task = run.configuration.task
     assert rest == [4, task.action_cost, task.action.bound]
 

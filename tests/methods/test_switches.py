@@ -7,6 +7,7 @@ from collected_episodes import collected_in
 from method_runs import Run
 
 from solar_cli.control.lqr import lqr_backward
+from solar_cli.episodes import Episodes
 from solar_cli.methods import local, solar
 from solar_cli.models.representation import Representation
 
@@ -99,3 +100,21 @@ def test_without_rejection_the_newest_is_built_upon_and_handed_over_however_bad(
             assert (run.learner.handed is run.learner.gains) == kept
             assert run.metrics[-1]["rejected"] == float(not kept)
             assert run.metrics[-1]["handed_over_untried"] == float(kept)
+
+
+@every
+@pytest.mark.parametrize("learned_from", [0, 1])
+def test_without_rejected_batches_what_was_taken_back_is_another_iterations(
+    tmp_path, monkeypatch, name, learned_from
+):
+    calls = answers(monkeypatch, local, "infer_dynamics")
+    worse = lambda iteration, costs: costs + {2: 1e3}.get(iteration, 0.0)  # noqa: E731
+    sets = small(name, f"update.rejected_batches={learned_from}")
+    run = Run(tmp_path, name, *sets, costs=worse).iterate(1, 2)
+    (newest, older, *_), _ = calls[1]
+    best, rejected = (collected_in(iteration, run.environment) for iteration in (1, 2))
+    together = [best, rejected] if learned_from else [best]
+    np.testing.assert_array_equal(newest.costs, Episodes.joined(together).costs)
+    assert len(older) == 1 - learned_from
+    if older:
+        np.testing.assert_array_equal(older[0].costs, rejected.costs)

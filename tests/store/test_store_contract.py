@@ -467,6 +467,18 @@ def test_a_cell_whose_method_is_gone_can_still_be_read(claimed: Claimed) -> None
     assert after.title == "nav/gone seed 0"
 
 
+def test_a_cell_can_still_be_read_when_a_value_of_its_settings_is_gone(claimed: Claimed) -> None:
+    store, hash, _ = claimed
+    before = store.find(hash).cell
+    old = text("UPDATE cell SET configuration = replace(configuration, 'convex', 'lbfgs')")
+    with store._database.writing() as session:
+        session.execute(old)
+    after = store.find(hash).cell
+    assert (after.hash, after.title) == (hash, before.title)
+    assert after.config()["method"]["cost_fit"]["optimiser"] == "lbfgs"
+    assert after.configuration.task == before.configuration.task
+
+
 def test_the_doctor_finds_a_sound_database_sound(claimed: Claimed) -> None:
     store, *_ = claimed
     report = store.diagnose()

@@ -15,7 +15,7 @@ from alembic.script import ScriptDirectory
 from sqlalchemy import Engine, Text, event, text
 from test_store_concurrency import processes
 
-from solar_cli.settings import Cell, restore
+from solar_cli.settings import Cell
 from solar_cli.store import describe
 from solar_cli.store.migrate import SCRIPTS
 from solar_cli.store.records import State
@@ -107,9 +107,9 @@ def test_a_database_of_every_past_schema_still_opens_with_all_it_holds(
     with Store.open(str(path)) as store:
         (record,) = store.cells()
         cell = record.cell
-        anew = restore(cell.task, cell.method, cell.variant, cell.seed, cell.config())
-        # The first is what the file says, the second what today's settings make of it.
-        assert record.hash == anew.hash == expected["hash"]
+        # Its settings have a value that today's do not know: cost fits by L-BFGS.
+        assert cell.config()["method"]["cost_fit"]["optimiser"] == "lbfgs"
+        assert record.hash == expected["hash"]
         assert record.state is State.FINISHED
         assert (record.iteration, record.episodes, record.commit) == (1, 40, "c0ffee")
         found = [
