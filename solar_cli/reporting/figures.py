@@ -19,6 +19,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from solar_cli.reporting.curves import Curve, Problem, SeedCurve
 from solar_cli.reporting.summary import title
 from solar_cli.reporting.tables import number
+from solar_cli.settings.registry import is_level
 from solar_cli.store.records import State
 from solar_cli.wording import counted
 
@@ -114,6 +115,8 @@ def _draw(axes: Axes, curve: Curve, colour: str, dashes: tuple[float, ...]) -> N
             held = (seed.episodes[-1], curve.end)
             axes.plot(held, [seed.penalty] * 2, ":", color=colour, linewidth=0.9, alpha=0.6)
     mean, std = curve.mean, curve.std
+    if is_level(curve.method):
+        axes.axhline(mean[-1], color=colour, linewidth=0.9, dashes=(1, 2), zorder=1)
     if std is not None:
         axes.fill_between(curve.grid, mean - std, mean + std, color=colour, alpha=0.18, linewidth=0)
     axes.plot(
@@ -151,7 +154,10 @@ def _scale(axes: Axes, problem: Problem) -> None:
     """Limits from what was measured, not from the band; logarithmic where that shows more."""
     means = np.concatenate([curve.mean for curve in problem.curves])
     measured = np.concatenate([seed.values for curve in problem.curves for seed in curve.seeds])
-    ends = [max(int(seed.episodes[-1]) for seed in curve.seeds) for curve in problem.curves]
+    learning = [curve for curve in problem.curves if not is_level(curve.method)]
+    ends = [
+        max(int(seed.episodes[-1]) for seed in curve.seeds) for curve in learning or problem.curves
+    ]
     positive = problem.measure.better == "lower" and measured.min() > 0
     if positive and means.max() > LOG_SPAN * means.min():
         axes.set_yscale("log")

@@ -38,6 +38,8 @@ class MethodEntry:
     """whether it sees the collected costs only, or the task's cost function"""
     deviations: str = ""
     """where it departs from its source, and why"""
+    learns: bool = True
+    """whether episodes make it better; where they do not, it is a level for others"""
 
 
 ON_POLICY = (
@@ -164,6 +166,7 @@ BUILT_IN = (
         source="reference policy",
         settings="solar_cli.settings.reference:Reference",
         learner="solar_cli.methods.reference:Zero",
+        learns=False,
     ),
     MethodEntry(
         name="random",
@@ -171,6 +174,7 @@ BUILT_IN = (
         source="reference policy",
         settings="solar_cli.settings.reference:Reference",
         learner="solar_cli.methods.reference:Random",
+        learns=False,
     ),
 )
 
@@ -214,6 +218,12 @@ def method(name: str) -> MethodEntry:
         raise UsageError(f"unknown method {name!r}: {nearest(name, known)}")
     entry = known[name]
     return entry if isinstance(entry, MethodEntry) else _foreign(entry)
+
+
+def is_level(name: str) -> bool:
+    """Whether a method is known to learn nothing; it may be gone, where results are read."""
+    known = _known()
+    return name in known and not method(name).learns
 
 
 def load(path: str) -> Any:

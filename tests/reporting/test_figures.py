@@ -108,3 +108,17 @@ def test_curves_look_different_up_to_the_size_of_the_palette():
     shown = learning_curve(problem(*(flat_curve(f"m{i}", [0.5]) for i in range(6))), DARK).axes[0]
     thick = [line for line in shown.lines if line.get_linewidth() == 2.0]
     assert [line.get_color() for line in thick] == list(PALE_PALETTE)
+
+
+def test_what_learns_nothing_is_a_level_for_all_episodes():
+    """It is evaluated for a few, and has no say in how episodes are drawn."""
+    learned = curve(seed(0, [(0, 1.0), (1000, 0.45), (4000, 0.2)]))
+    axes = axes_of(learned, flat_curve("zero", [0.9, 0.7]))
+    assert axes.get_xscale() == "linear"
+    assert axes_of(learned, flat_curve("vae", [0.9, 0.7])).get_xscale() == "symlog"
+    levels = [line for line in axes.lines if np.ptp(line.get_ydata()) == 0]
+    spans = [line for line in levels if line.get_transform() == axes.get_yaxis_transform()]
+    assert {round(float(line.get_ydata()[0]), 6) for line in spans} == {
+        0.8,
+        0.5,
+    }  # of the card 0.5 too
