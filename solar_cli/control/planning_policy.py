@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -21,7 +22,7 @@ class Planner(Protocol):
     """What chooses actions for the next H steps."""
 
     def __call__(
-        self, states: Float[Tensor, "N z"], t: int, before: Float[Tensor, "N H a"] | None
+        self, seen: Float[Tensor, "N *z"], t: int, before: Float[Tensor, "N H a"] | None, /
     ) -> Float[Tensor, "N H a"]:
         """Plans for step ``t``; ``before`` are those of the step before, None at the start."""
 
@@ -37,18 +38,31 @@ class Acting(NamedTuple):
     """of the step before"""
 
 
+See = Callable[[NDArray[Any], int, Acting], tuple[Tensor, Followed]]
+"""What to plan from at a step, given windows (N, W, *frame), and what the next step is given."""
+
+
+def latents_of(embedding: Embedding, window: int) -> See:
+    """States of an embedding; only the newest frame is encoded."""
+
+    def see(
+        observations: NDArray[Any], t: int, state: Acting
+    ) -> tuple[Float[Tensor, "N z"], Followed]:
+        z, followed = latest_state(
+            embedding, observations, t, state.followed, state.actions, window
+        )
+        return z.float(), followed
+
+    return see
+
+
 class PlanningPolicy:
-    """a_t: the first action of the plan for the state of now, and noise of deviation ``std``."""
+    """a_t: the first action of the plan for what is seen, and noise of deviation ``std``."""
 
     def __init__(
-        self,
-        embedding: Embedding,
-        planner: Planner,
-        std: float,
-        smoothing: float,
-        task: TaskSettings,
+        self, see: See, planner: Planner, std: float, smoothing: float, task: TaskSettings
     ) -> None:
-        self.embedding, self.planner = embedding, planner
+        self.see, self.planner = see, planner
         self.std, self.smoothing, self.task = std, smoothing, task
 
     def start(self, episodes: int, stream: np.random.Generator | None) -> Acting:
@@ -62,12 +76,9 @@ class PlanningPolicy:
     def act(
         self, observations: NDArray[Any], t: int, state: Acting
     ) -> tuple[Floats, Floats, Acting]:
-        """As `Policy.act`; only the newest frame is encoded."""
-        window = self.task.observation.window
-        z, followed = latest_state(
-            self.embedding, observations, t, state.followed, state.actions, window
-        )
-        plan = self.planner(z.float(), t, state.plan)
+        """As `Policy.act`."""
+        seen, followed = self.see(observations, t, state)
+        plan = self.planner(seen, t, state.plan)
         mean = plan[:, 0].double().cpu().numpy()
         action = mean + state.noise[:, t]
         acted = Acting(state.noise, followed, plan, torch.from_numpy(action.copy()))

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from solar_cli.control.exploration import Exploration, smooth_noise
 from solar_cli.control.planning import RolledOut, Search, cross_entropy, shifted
-from solar_cli.control.planning_policy import PlanningPolicy
+from solar_cli.control.planning_policy import PlanningPolicy, latents_of
 from solar_cli.episodes import Batch, Policy
 from solar_cli.errors import UsageError
 from solar_cli.experience import Experience
@@ -77,9 +77,8 @@ class GlobalMpc(LatentLearner):
             return Exploration(self.task)
         exploration = self.task.exploration
         noise = self.settings.planner.noise * exploration.std
-        return PlanningPolicy(
-            self.representation, self._plan, noise, exploration.smoothing, self.task
-        )
+        see = latents_of(self.representation, self.task.observation.window)
+        return PlanningPolicy(see, self._plan, noise, exploration.smoothing, self.task)
 
     def iterate(self, experience: Experience) -> dict[str, float]:
         """Collect with the planner; fit the representation, then both networks to all episodes."""

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from solar_cli.control.exploration import Exploration
 from solar_cli.control.planning import RolledOut, random_shooting
-from solar_cli.control.planning_policy import PlanningPolicy
+from solar_cli.control.planning_policy import PlanningPolicy, latents_of
 from solar_cli.envs import state_cost
 from solar_cli.episodes import Policy
 from solar_cli.errors import UsageError
@@ -72,7 +72,7 @@ class MpcNn(Learner):
         if not self.model.fitted:
             return Exploration(self.task)
         noise = self.settings.shooting.noise * self.task.action.bound
-        return PlanningPolicy(self.states, self._plan, noise, 0.0, self.task)
+        return PlanningPolicy(latents_of(self.states, 1), self._plan, noise, 0.0, self.task)
 
     def iterate(self, experience: Experience) -> dict[str, float]:
         """Collect with the planner, and fit the network to all episodes so far."""

@@ -14,7 +14,7 @@ Axes: N episodes, S action sequences, H steps ahead, P actions of a plan, a entr
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,8 +22,10 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from solar_cli.control.exploration import Exploration, smooth_noise
+from solar_cli.control.exploration import Exploration
+from solar_cli.control.latent_policy import Followed
 from solar_cli.control.planning import Search, cross_entropy
+from solar_cli.control.planning_policy import Acting, PlanningPolicy
 from solar_cli.episodes import Episodes, Evaluation, Policy
 from solar_cli.experience import Experience
 from solar_cli.methods import Learner
@@ -39,16 +41,8 @@ JUDGED_CLIPS = 300
 """of an evaluation, to diagnose the model with"""
 
 
-class Planned(NamedTuple):
-    """What the planner carries through an episode."""
-
-    noise: Floats
-    """(N, T, a)"""
-    plan: Float[Tensor, "N P a"]
-
-
-class Planner:
-    """A `Policy` that plans anew at every step, from the plan before."""
+class PixelPlanner:
+    """Plans from pooled windows of frames, anew at every step, from the plan before."""
 
     def __init__(
         self, settings: PixelMpcSettings, task: TaskSettings, model: VideoModel, streams: Streams
@@ -64,36 +58,29 @@ class Planner:
             planner.least_std * std,
         )
 
-    def start(self, episodes: int, stream: np.random.Generator | None) -> Planned:
-        """Noise of whole episodes, and no plan yet."""
-        size, noise = self.task.action.size, self.task.exploration
-        shape = (episodes, self.task.horizon, size)
-        drawn = np.zeros(shape)
-        if stream is not None:
-            std = self.settings.noise * noise.std
-            drawn = std * smooth_noise(shape, noise.smoothing, stream)
-        plan = torch.zeros(episodes, self.actions, size, device=self.model.frame_mean.device)
-        return Planned(drawn, plan)
+    def see(
+        self, observations: NDArray[Any], t: int, state: Acting
+    ) -> tuple[Float[Tensor, "N W C h w"], Followed]:
+        """The frames of now, as the model sees them; nothing is carried."""
+        frames = torch.from_numpy(np.ascontiguousarray(observations))
+        pooled = self.model.pooled(frames.to(self.model.frame_mean.device))
+        return self.model.scaled(pooled), state.followed
 
-    @torch.no_grad()
-    def act(
-        self, observations: NDArray[Any], t: int, state: Planned
-    ) -> tuple[Floats, Floats, Planned]:
-        """The first action of the plan, and noise."""
-        plan = state.plan
+    def __call__(
+        self, window: Float[Tensor, "N W C h w"], t: int, before: Float[Tensor, "N P a"] | None
+    ) -> Float[Tensor, "N P a"]:
+        """As `Planner`: the cross-entropy method, from the plan of the step before."""
+        shape = (self.actions, self.task.action.size)
+        mean = window.new_zeros(len(window), *shape) if before is None else self.later(before)
 
         def normal(iteration: int) -> Float[Tensor, "S P a"]:
             draws = self.streams.generator("plan", t, iteration)
-            shape = (self.settings.samples, *plan.shape[1:])
-            return torch.from_numpy(draws.standard_normal(shape, dtype=np.float32)).to(plan)
+            samples = draws.standard_normal((self.settings.samples, *shape), dtype=np.float32)
+            return torch.from_numpy(samples).to(window)
 
-        seen = torch.from_numpy(np.ascontiguousarray(observations)).to(plan.device)
-        window = self.model.scaled(self.model.pooled(seen))
-        plan = cross_entropy(
-            lambda actions: self.forecast(window, actions), plan, self.search, normal
+        return cross_entropy(
+            lambda actions: self.forecast(window, actions), mean, self.search, normal
         )
-        mean = plan[:, 0].double().cpu().numpy()
-        return mean + state.noise[:, t], mean, Planned(state.noise, self.later(plan))
 
     def forecast(
         self, window: Float[Tensor, "N W C h w"], actions: Float[Tensor, "N S P a"]
@@ -140,7 +127,10 @@ class PixelMpc(Learner):
         """The planner, or before anything is known the card's exploration noise."""
         if not self.trained:
             return Exploration(self.task)
-        return Planner(self.settings, self.task, self.model, self.streams.under("planning"))
+        streams, exploration = self.streams.under("planning"), self.task.exploration
+        planner = PixelPlanner(self.settings, self.task, self.model, streams)
+        noise = self.settings.planner.noise * exploration.std
+        return PlanningPolicy(planner.see, planner, noise, exploration.smoothing, self.task)
 
     def iterate(self, experience: Experience) -> dict[str, float]:
         """Collect with the planner, and train on all episodes so far."""

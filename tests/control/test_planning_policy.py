@@ -5,7 +5,7 @@ import torch
 from test_latent_policy import Embedding, N, T, W, a, d, frames
 
 from solar_cli.control.exploration import smooth_noise
-from solar_cli.control.planning_policy import PlanningPolicy
+from solar_cli.control.planning_policy import PlanningPolicy, latents_of
 from solar_cli.episodes import window_indices
 from solar_cli.settings import TaskSettings
 
@@ -48,7 +48,9 @@ def run(policy: PlanningPolicy, seen: np.ndarray, stream=None) -> tuple[np.ndarr
 
 def test_it_takes_the_first_action_of_a_plan_for_the_window_it_sees():
     planner, embedding = Planner(), Embedding()
-    actions, means = run(PlanningPolicy(embedding, planner, 0.5, 0.0, task()), frames())
+    actions, means = run(
+        PlanningPolicy(latents_of(embedding, W), planner, 0.5, 0.0, task()), frames()
+    )
     index = window_indices(T, W)
     for t, (states, at, _) in enumerate(planner.asked):
         windows = torch.from_numpy(frames()[:, index[t][::-1], :d])
@@ -61,13 +63,13 @@ def test_it_takes_the_first_action_of_a_plan_for_the_window_it_sees():
 
 def test_every_frame_is_encoded_once():
     embedding = Embedding()
-    run(PlanningPolicy(embedding, Planner(), 0.5, 0.0, task()), frames())
+    run(PlanningPolicy(latents_of(embedding, W), Planner(), 0.5, 0.0, task()), frames())
     np.testing.assert_array_equal(np.stack(embedding.encoded, axis=1), frames()[:, :T])
 
 
 def test_a_plan_is_handed_to_the_next_step_and_an_episode_starts_without():
     planner = Planner()
-    policy = PlanningPolicy(Embedding(), planner, 0.5, 0.0, task())
+    policy = PlanningPolicy(latents_of(Embedding(), W), planner, 0.5, 0.0, task())
     run(policy, frames())
     run(policy, frames())
     befores = [before for _, _, before in planner.asked]
@@ -80,7 +82,7 @@ def test_a_plan_is_handed_to_the_next_step_and_an_episode_starts_without():
 
 
 def test_noise_is_smooth_has_its_deviation_and_is_not_in_the_means():
-    policy = PlanningPolicy(Embedding(), Planner(), 0.5, 1.5, task())
+    policy = PlanningPolicy(latents_of(Embedding(), W), Planner(), 0.5, 1.5, task())
     noisy, means = run(policy, frames(), np.random.default_rng(5))
     quiet, _ = run(policy, frames())
     np.testing.assert_allclose(means, quiet)

@@ -7,10 +7,11 @@ from bits import digest
 from collected_episodes import collected_in
 from method_runs import Run
 
+from solar_cli.control.planning_policy import PlanningPolicy
 from solar_cli.envs import build_task
 from solar_cli.episodes import Evaluation, evaluate
 from solar_cli.methods import Diverged, Foreseeing
-from solar_cli.methods.pixel_mpc import Planner
+from solar_cli.methods.pixel_mpc import PixelPlanner
 from solar_cli.models import video_training
 from solar_cli.models.video import Step, VideoModel
 from solar_cli.streams import Streams
@@ -47,10 +48,10 @@ class Aiming(VideoModel):
             yield Step(torch.empty(0), cost.flatten())
 
 
-def planner(tmp_path, *sets, model=Aiming) -> Planner:
+def planner(tmp_path, *sets, model=Aiming) -> PixelPlanner:
     one = run(tmp_path, *sets)
     settings, task = one.configuration.method, one.configuration.task
-    return Planner(settings, task, model(settings.video, task), Streams(0))
+    return PixelPlanner(settings, task, model(settings.video, task), Streams(0))
 
 
 def seen(count: int) -> np.ndarray:
@@ -62,7 +63,8 @@ def test_a_plan_finds_the_actions_that_cost_least(tmp_path, repeat):
     search = (
         f"planner={{ horizon = 5, repeat = {repeat}, samples = 300, iterations = 8, elites = 20 }}"
     )
-    policy = planner(tmp_path, search)
+    one = planner(tmp_path, search)
+    policy = PlanningPolicy(one.see, one, 0.0, 0.0, one.task)
     wanted, means, state = policy.act(seen(4), 0, policy.start(4, None))
     np.testing.assert_array_equal(wanted, means)
     np.testing.assert_allclose(means, np.tile(Aiming.aim.numpy(), (4, 1)), atol=0.01)
