@@ -229,7 +229,7 @@ def _posterior(
     for source, weight in zip(sources, weights, strict=True):
         if source is not None:
             natural = natural.plus(source.scaled(weight.unsqueeze(-1)))
-    F, Sigma = mniw.point_estimate(mniw.standard(natural))
+    F, Sigma = mniw.point_estimate(natural)
     x_mean, y_mean = samples.means()
     f = y_mean[:, 0] - (F @ x_mean.mT).squeeze(-1)
     return _increments(F, f, Sigma, samples)

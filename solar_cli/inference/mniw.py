@@ -75,17 +75,23 @@ def natural(q: MNIW) -> RegressionStatistics:
 
 
 def standard(parameters: RegressionStatistics) -> MNIW:
-    """The belief with these natural parameters.
+    """The belief with these natural parameters."""
+    L_xx, M, Psi = _regression(parameters)
+    whitening = cholesky.inverse_factor(L_xx)
+    return MNIW(Psi, parameters.n, M, whitening.mT @ whitening)
 
-    One Cholesky factor of [[C, B^T], [B, A]] gives Psi = A - B C^-1 B^T as a product of its lower
-    right block, so Psi stays positive definite where the subtraction would not.
+
+def _regression(parameters: RegressionStatistics) -> tuple[Tensor, Tensor, Tensor]:
+    """The Cholesky factor of C, the slopes B C^-1, and Psi = A - B C^-1 B^T.
+
+    One Cholesky factor of [[C, B^T], [B, A]] gives Psi as a product of its lower right block, so
+    that it stays positive definite where the subtraction would not.
     """
     p = parameters.xx.shape[-1]
     factor = _joint_factor(parameters)
     L_xx, L_yx, L_yy = factor[..., :p, :p], factor[..., p:, :p], factor[..., p:, p:]
     M = torch.linalg.solve_triangular(L_xx, L_yx, upper=False, left=False)
-    whitening = cholesky.inverse_factor(L_xx)
-    return MNIW(L_yy @ L_yy.mT, parameters.n, M, whitening.mT @ whitening)
+    return L_xx, M, L_yy @ L_yy.mT
 
 
 def _joint_factor(parameters: RegressionStatistics) -> Float[Tensor, "*batch pd pd"]:
@@ -194,9 +200,12 @@ def natural_gradient_step(
     return current.scaled(1 - rate).plus(target.scaled(rate))
 
 
-def point_estimate(q: MNIW) -> tuple[Float[Tensor, "*batch d p"], Float[Tensor, "*batch d d"]]:
+def point_estimate(
+    parameters: RegressionStatistics,
+) -> tuple[Float[Tensor, "*batch d p"], Float[Tensor, "*batch d d"]]:
     """F = M and Sigma = Psi / nu of section 4.1, which is (E[S^-1])^-1 and not the mode."""
-    return q.M, q.Psi / q.nu[..., None, None]
+    _, M, Psi = _regression(parameters)
+    return M, Psi / parameters.n[..., None, None]
 
 
 def centred(statistics: RegressionStatistics, constant: int) -> RegressionStatistics:
