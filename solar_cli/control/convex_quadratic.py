@@ -119,10 +119,11 @@ def least_squares(
 
     Without that condition it is a linear system. What is negative of its C is cut off, and
     ``rounds`` of the alternating direction method of multipliers (Boyd et al. 2011, section 5) find
-    what else of C should change then: after 30 the objective is within 1 % of the least one. c and
-    b are the best ones for the C that is found.
+    what else of C should change then: 30 bring the objective within 2 % of the least one
+    (`test_convex_quadratic`). c and b are the best ones for the C that is found.
 
-    Raises ``torch.linalg.LinAlgError`` where moments are not finite.
+    Raises ``torch.linalg.LinAlgError`` where moments are not finite, or where they do not tell all
+    coefficients and ``penalty`` is zero.
     """
     A, b = mean.xx + torch.diag_embed(penalty), mean.xy + penalty * towards
     q = b.shape[-1]
@@ -147,7 +148,10 @@ def least_squares(
 
 
 def descended(mean: Moments, penalty: Float[Tensor, "*#k q"]) -> Float[Tensor, "*k q"]:
-    """The same towards zero, by gradients through C = L L^T; L has a positive diagonal (paper)."""
+    """The same towards zero, by gradients through C = L L^T, as section 3 parametrises it.
+
+    L has a positive diagonal.
+    """
     m = _features(mean.xy.shape[-1])
     L = -torch.eye(m).to(mean.xy).repeat(*mean.n.shape, 1, 1)
     rest = mean.xy.new_zeros(*mean.n.shape, m + 1)
