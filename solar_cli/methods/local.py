@@ -161,8 +161,8 @@ class LocalLearner(LatentLearner):
         """What an update is made from.
 
         Episodes of policies that were taken back are part of it: the model that promised much of
-        them sees where it was wrong. Without them it promises the same again (car, seed 6: nine
-        rejections in a row, and 3.3 to the target at 400 episodes; with them .5 at 260).
+        them sees where it was wrong. Without them it may promise the same again: the car of seed 6
+        is 3.3 from its target at 320 episodes with `update.rejected_batches` = 0, and .16 with 2.
 
         An iteration of which only episodes without noise are left, a rejected one, says nothing of
         what actions do.
