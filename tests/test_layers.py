@@ -8,7 +8,7 @@ import pytest
 
 PACKAGE = Path(__file__).parent.parent / "solar_cli"
 LAYERS = (
-    ("errors", "streams", "pulse", "wording"),
+    ("errors", "stopwatch", "streams", "pulse", "wording"),
     ("settings",),
     ("inference",),
     ("envs",),

@@ -1,10 +1,10 @@
-"""Quadratics w^T [z_i z_j; z_i; 1] = 1/2 z^T C z + c^T z + b of the least squared error, C >= 0.
+"""Quadratics 1/2 z^T C z + c^T z + b of the least squared error, C >= 0.
 
-A quadratic is linear in its coefficients w, and so that error is a quadratic in w, which the second
-moments of monomials tell; of those that are convex the best is found by convex optimisation.
+A quadratic is linear in its weights w of monomials, and so that error is a quadratic in w, which
+their second moments tell; of those that are convex the best is found by convex optimisation.
 
-Axes: T horizon, N episodes, n samples of a fit, m features of z, q = m (m + 1) / 2 + m + 1
-monomials of them. The leading axes k are of fits that are made at once.
+Axes: T horizon, N episodes, n samples of a fit, m features of z, q monomials of them. The leading
+axes k are of fits that are made at once.
 """
 
 from __future__ import annotations
@@ -16,15 +16,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from solar_cli.inference import quadratics
+
 PENALTY = 0.1  # of the search for C, in units of the mean square of a monomial of second degree
 SGD_STEPS = 1000
 SGD_RATE = 1e-2
-
-
-def _monomials(z: Float[Tensor, "*k n m"]) -> Float[Tensor, "*k n q"]:
-    """[z_i z_j for j <= i; z; 1]: a quadratic is linear in them."""
-    i, j = torch.tril_indices(z.shape[-1], z.shape[-1])
-    return torch.cat([z[..., i] * z[..., j], z, torch.ones_like(z[..., :1])], dim=-1)
 
 
 class Moments(NamedTuple):
@@ -42,7 +38,7 @@ class Moments(NamedTuple):
     ) -> Moments:
         """Of every time step, over the episodes that were still running."""
         over = ~live.T
-        x = _monomials(z.transpose(0, 1)).masked_fill(over.unsqueeze(-1), 0.0)
+        x = quadratics.monomials(z.transpose(0, 1)).masked_fill(over.unsqueeze(-1), 0.0)
         y = costs.T.masked_fill(over, 0.0)
         xy = (x.mT @ y.unsqueeze(-1)).squeeze(-1)
         return Moments(x.mT @ x, xy, y.square().sum(dim=1), live.sum(dim=0).to(y))
@@ -78,37 +74,6 @@ class Moments(NamedTuple):
         return Moments(self.xx / n[..., None, None], self.xy / n[..., None], self.yy / n, self.n)
 
 
-def _features(q: int) -> int:
-    """m, of q = m (m + 1) / 2 + m + 1 monomials."""
-    m: int = round((2 * q + 0.25) ** 0.5 - 1.5)
-    return m
-
-
-def curvature(w: Float[Tensor, "*k q"]) -> Float[Tensor, "*k m m"]:
-    """C of weights of monomials."""
-    m = _features(w.shape[-1])
-    i, j = torch.tril_indices(m, m)
-    half = w.new_zeros(*w.shape[:-1], m, m)
-    half[..., i, j] = w[..., : len(i)]
-    return half + half.mT
-
-
-def _coefficients(
-    C: Float[Tensor, "*k m m"], rest: Float[Tensor, "*k m1"]
-) -> Float[Tensor, "*k q"]:
-    """Weights of `_monomials`, of which ``rest`` are the last ones, [c; b]."""
-    i, j = torch.tril_indices(*C.shape[-2:])
-    halves = torch.where(i == j, 0.5, 1.0).to(C)
-    return torch.cat([halves * C[..., i, j], rest], dim=-1)
-
-
-def squares(q: int) -> Float[Tensor, " q"]:
-    """Of squared coefficients in |C|^2 / 2 + |c|^2."""
-    m = _features(q)
-    i, j = torch.tril_indices(m, m)
-    return torch.cat([torch.where(i == j, 2.0, 1.0), torch.ones(m), torch.zeros(1)])
-
-
 def least_squares(
     mean: Moments,
     penalty: Float[Tensor, "*#k q"],
@@ -127,21 +92,21 @@ def least_squares(
     """
     A, b = mean.xx + torch.diag_embed(penalty), mean.xy + penalty * towards
     q = b.shape[-1]
-    second = q - _features(q) - 1
+    second = q - quadratics.features(q) - 1
     scale = torch.diagonal(A, dim1=-2, dim2=-1)[..., :second].mean(dim=-1, keepdim=True)
     # |C|^2 = 2 |w|^2 in these weights.
-    coupling = 2 * PENALTY * scale * squares(q).to(b)
+    coupling = 2 * PENALTY * scale * quadratics.squares(q).to(b)
     coupling[..., second:] = 0
-    C = curvature(_divided(b, torch.linalg.cholesky(A)))
+    C = quadratics.curvature(_divided(b, torch.linalg.cholesky(A)))
     split, dual = _nonnegative(C), torch.zeros_like(C)
     if rounds:
         factor = torch.linalg.cholesky(A + torch.diag_embed(coupling))
     for _ in range(rounds):
         dual = dual + C - split
-        wanted = _coefficients(split - dual, torch.zeros_like(b[..., second:]))
-        C = curvature(_divided(b + coupling * wanted, factor))
+        wanted = quadratics.coefficients(split - dual, torch.zeros_like(b[..., second:]))
+        C = quadratics.curvature(_divided(b + coupling * wanted, factor))
         split = _nonnegative(C + dual)
-    curved = _coefficients(split, b[..., :0])
+    curved = quadratics.coefficients(split, b[..., :0])
     left = b[..., second:] - _product(A[..., second:, :second], curved)
     rest = _divided(left, torch.linalg.cholesky(A[..., second:, second:]))
     return torch.cat([curved, rest], dim=-1)
@@ -152,25 +117,25 @@ def descended(mean: Moments, penalty: Float[Tensor, "*#k q"]) -> Float[Tensor, "
 
     L has a positive diagonal.
     """
-    m = _features(mean.xy.shape[-1])
+    m = quadratics.features(mean.xy.shape[-1])
     L = -torch.eye(m).to(mean.xy).repeat(*mean.n.shape, 1, 1)
     rest = mean.xy.new_zeros(*mean.n.shape, m + 1)
     parameters = [L.requires_grad_(), rest.requires_grad_()]
     optimiser = torch.optim.SGD(parameters, SGD_RATE, momentum=0.9)
 
-    def coefficients() -> Tensor:
+    def parametrised() -> Tensor:
         diagonal = torch.nn.functional.softplus(torch.diagonal(L, dim1=-2, dim2=-1))
         cholesky = L.tril(-1) + torch.diag_embed(diagonal)
-        return _coefficients(cholesky @ cholesky.mT, rest)
+        return quadratics.coefficients(cholesky @ cholesky.mT, rest)
 
     for _ in range(SGD_STEPS):
-        w = coefficients()
+        w = parametrised()
         loss = (mean.error(w) + _inner(penalty, w.square())).sum()
         optimiser.zero_grad()
         torch.autograd.backward(loss)
         optimiser.step()
     with torch.no_grad():
-        return coefficients()
+        return parametrised()
 
 
 def _divided(b: Float[Tensor, "*k q"], factor: Float[Tensor, "*k q q"]) -> Float[Tensor, "*k q"]:

@@ -17,11 +17,11 @@ from itertools import groupby, product
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from solar_cli.control.linear_gaussian import LinearDynamics
-from solar_cli.control.trajectories import Trajectories, Transitions
+from solar_cli.control.trajectories import Trajectories, Transitions, judged_steps
 from solar_cli.inference import cholesky, gmm, mniw
 from solar_cli.models.priors import LatentPrior
 from solar_cli.settings.local import LocalFit
@@ -53,8 +53,8 @@ class Increments(NamedTuple):
     Sigma: Float[Tensor, "*k T d d"]
 
 
-Fit = Callable[[Transitions], Increments]
-"""from samples to the dynamics of every time step, or to alternatives of them"""
+Fit = Callable[[Transitions, Tensor], Increments]
+"""from samples to the dynamics of some time steps, or to alternatives of them"""
 
 
 class LocalDynamics(NamedTuple):
@@ -91,11 +91,15 @@ def infer_dynamics(
         score = _held_out(fit, samples, settings.folds)
     metrics["one_step_log_likelihood"] = float(score.log_likelihood)
     metrics["one_step_r2"] = float(score.r2)
-    return LocalDynamics(_whole(fit(samples), newest, prior), metrics)
+    every = torch.arange(len(samples.live))
+    return LocalDynamics(_whole(fit(samples, every), newest, prior), metrics)
 
 
 class _Score(NamedTuple):
-    """One-step prediction on folds that were left out of the fit, of each alternative."""
+    """One-step prediction on folds that were left out of the fit, of each alternative.
+
+    At some time steps, `judged_steps`.
+    """
 
     log_likelihood: Float[Tensor, "*k"]
     """nats a transition"""
@@ -104,20 +108,20 @@ class _Score(NamedTuple):
 
 
 def _held_out(fit: Fit, samples: Transitions, folds: int) -> _Score:
-    count = samples.live.shape[1]
-    fold = torch.arange(count) % min(folds, count)
+    count, times = samples.live.shape[1], judged_steps(samples.sampled)
+    fold, judged = torch.arange(count) % min(folds, count), samples.at(times)
     likelihood = squared = samples.y.new_zeros(())
     for k in range(int(fold.max()) + 1):
-        learned, judge = samples.of(fold != k), samples.of(fold == k)
-        fitted = fit(learned)
+        learned, judge = samples.of(fold != k), judged.of(fold == k)
+        fitted = fit(learned, times)
         residual = judge.y - judge.x @ fitted.F.mT - fitted.f.unsqueeze(-2)
-        spread = fitted.Sigma * (1 + 1 / learned.counts[:, None, None])
+        spread = fitted.Sigma * (1 + 1 / learned.counts[times, None, None])
         likelihood = likelihood + (_log_density(residual, spread) * judge.live).sum(dim=(-2, -1))
         wrong = residual.square().sum(dim=-1) * judge.live
         squared = squared + wrong.sum(dim=(-2, -1))
-    total = float(samples.live.sum())
-    deviation = samples.y - samples.y.sum(dim=(0, 1)) / total
-    spread_of_y = float((deviation.square() * samples.live.unsqueeze(-1)).sum())
+    total = float(judged.live.sum())
+    deviation = judged.y - judged.y.sum(dim=(0, 1)) / total
+    spread_of_y = float((deviation.square() * judged.live.unsqueeze(-1)).sum())
     return _Score(likelihood / total, 1 - squared / max(spread_of_y, 1e-12))
 
 
@@ -216,30 +220,28 @@ def _posterior(
     reach: tuple[float, float],
     counts: Sequence[tuple[float, float]] | tuple[float, float],
     samples: Transitions,
+    times: Int[Tensor, " times"],
 ) -> Increments:
-    """The point estimate of every time step: appendix B is a sum in natural parameters.
+    """The point estimate of time steps: appendix B is a sum in natural parameters.
 
     ``reach`` is width and weight of neighbours, ``counts`` the pseudo-counts of the model and of
     older batches; several of them are the first axis of what is returned.
     """
-    own = _centred_statistics(samples)
-    natural = _pooled(own, _neighbourhood(len(own.n), *reach))
+    own, steps = _centred_statistics(samples), samples.steps(times)
+    natural = _pooled(own, _neighbourhood(len(own.n), *reach)[steps])
     model, older = own.yy.new_tensor(counts).unbind(dim=-1)
     weights = (torch.ones_like(model), model, older)
     for source, weight in zip(sources, weights, strict=True):
         if source is not None:
-            natural = natural.plus(source.scaled(weight.unsqueeze(-1)))
+            natural = natural.plus(source.at(steps).scaled(weight.unsqueeze(-1)))
     F, Sigma = mniw.point_estimate(natural)
-    x_mean, y_mean = samples.means()
+    x_mean, y_mean = samples.at(times).means()
     f = y_mean[:, 0] - (F @ x_mean.mT).squeeze(-1)
-    return _increments(F, f, Sigma, samples)
+    return Increments(F, f, _bounded(Sigma))
 
 
-def _increments(F: Tensor, f: Tensor, Sigma: Tensor, samples: Transitions) -> Increments:
-    """Bounded below, and held from the last time step that has a sample."""
-    Sigma = Sigma + LEAST_VARIANCE * torch.eye(Sigma.shape[-1]).to(Sigma)
-    times = torch.arange(len(samples.live)).clamp(max=samples.sampled - 1)
-    return Increments(F[..., times, :, :], f[..., times, :], Sigma[..., times, :, :])
+def _bounded(Sigma: Float[Tensor, "*k d d"]) -> Float[Tensor, "*k d d"]:
+    return Sigma + LEAST_VARIANCE * torch.eye(Sigma.shape[-1]).to(Sigma)
 
 
 def _grid(sources: _Sources, settings: LocalFit) -> list[Strengths]:
@@ -266,36 +268,45 @@ def _log_density(
     return density
 
 
-def _regression(samples: Transitions) -> Increments:
+def _regression(samples: Transitions, times: Int[Tensor, " times"]) -> Increments:
     """Least squares per time step, without a prior."""
-    x, y, live = samples
+    local = samples.at(times)
+    x, y, live = local
     one = live.unsqueeze(-1)
     solution = torch.linalg.lstsq(torch.cat([x, one], dim=-1), y, driver="gelsd").solution
     F, f = solution[:, :-1].mT, solution[:, -1]
     residual = (y - x @ F.mT - f.unsqueeze(1)) * one
-    Sigma = residual.mT @ residual / samples.counts[:, None, None]
-    return _increments(F, f, Sigma, samples)
+    Sigma = residual.mT @ residual / local.counts[:, None, None]
+    return Increments(F, f, _bounded(Sigma))
 
 
 def _mixture_prior(
-    past: Sequence[Transitions], streams: Streams, samples: Transitions
+    past: Sequence[Transitions],
+    streams: Streams,
+    samples: Transitions,
+    times: Int[Tensor, " times"],
 ) -> Increments:
     """LQR-FLM's fit (Levine and Abbeel 2014): a Gaussian mixture is the prior of every step.
 
     The mixture sees older batches too, as in the authors' release of guided policy search.
     """
     seen = [torch.cat([batch.x, batch.y], dim=-1)[batch.live > 0] for batch in (samples, *past)]
-    flat, sampled, stream = torch.cat(seen), samples.sampled, streams.generator("mixture")
+    flat, local, stream = torch.cat(seen), samples.at(times), streams.generator("mixture")
     if len(flat) > MOST_POINTS:
         flat = flat[stream.choice(len(flat), MOST_POINTS, replace=False)]
     fit = gmm.fit_mixture(flat, gmm.cluster_count(len(flat)), stream)
-    points, live = torch.cat([samples.x, samples.y], dim=-1)[:sampled], samples.live[:sampled]
-    joint = gmm.fit_joint(points, gmm.local_prior(fit.mixture, points, live), live)
+    points = torch.cat([local.x, local.y], dim=-1)
+    joint = gmm.fit_joint(points, gmm.local_prior(fit.mixture, points, local.live), local.live)
     F, f, Sigma = gmm.condition_joint(joint, samples.x.shape[-1])
-    return _increments(F, f, Sigma, samples)
+    return Increments(F, f, _bounded(Sigma))
 
 
-def _linearised(prior: LatentPrior, settings: LocalFit, samples: Transitions) -> Increments:
+def _linearised(
+    prior: LatentPrior,
+    settings: LocalFit,
+    samples: Transitions,
+    times: Int[Tensor, " times"],
+) -> Increments:
     """The slopes of the model's own network at the mean of every time step.
 
     Its errors on these samples give the rest: their mean goes to the offset, as with every other
@@ -303,7 +314,8 @@ def _linearised(prior: LatentPrior, settings: LocalFit, samples: Transitions) ->
     """
     network, basis, d = prior.transition, prior.basis, prior.latent
     assert network is not None
-    x_mean, y_mean = samples.means()
+    local = samples.at(times)
+    x_mean, y_mean = local.means()
     states = x_mean[:, 0, : len(basis.b)]
     inverse, white = torch.linalg.inv(basis.A), basis.A[:d, :d]
     of_windows, of_actions = network.slopes(
@@ -312,11 +324,11 @@ def _linearised(prior: LatentPrior, settings: LocalFit, samples: Transitions) ->
     F = white @ torch.cat([of_windows @ inverse, of_actions], dim=-1)
     F[..., :d] -= torch.eye(d).to(F)  # increments of the newest block
     f = (y_mean - x_mean @ F.mT)[:, 0]
-    residual = (samples.y - samples.x @ F.mT - f.unsqueeze(1)) * samples.live.unsqueeze(-1)
+    residual = (local.y - local.x @ F.mT - f.unsqueeze(1)) * local.live.unsqueeze(-1)
     degrees = d + 2.0
     weak = degrees * settings.ridge**2 * torch.eye(d).to(F)
-    Sigma = (residual.mT @ residual + weak) / (samples.counts + degrees)[:, None, None]
-    return _increments(F, f, Sigma, samples)
+    Sigma = (residual.mT @ residual + weak) / (local.counts + degrees)[:, None, None]
+    return Increments(F, f, _bounded(Sigma))
 
 
 def _whole(increments: Increments, newest: Trajectories, prior: LatentPrior) -> LinearDynamics:

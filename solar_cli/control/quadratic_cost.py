@@ -14,15 +14,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import reduce
 from itertools import product
+from operator import itemgetter
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from solar_cli.control.convex_quadratic import Moments, curvature, descended, least_squares, squares
+from solar_cli.control.convex_quadratic import Moments, descended, least_squares
 from solar_cli.control.linear_gaussian import QuadraticCost
-from solar_cli.control.trajectories import Trajectories
+from solar_cli.control.trajectories import Trajectories, judged_steps
+from solar_cli.inference import quadratics
 from solar_cli.settings.local import CostFit
 
 ROUNDS = 30
@@ -91,7 +93,8 @@ def fit_quadratic_cost(
     best = max(scores, key=lambda choice: scores[choice])
     w = _fit_shared(whole.together(), support, [best], settings)[0]
     if best.per_time:
-        w = _fit_each(whole, w, settings)
+        every = torch.arange(len(whole.n))
+        w = _fit_each(_near(whole, every, settings.width), w)
     model = _assembled(w, states, features, action_cost, mean, scale, settings.terminal)
     return FittedCost(model, scores[best], best)
 
@@ -106,7 +109,8 @@ def _held_out(
 ) -> dict[Choice, float]:
     """R2 of every choice on the episodes that a fit was not given; ``whole`` is of all folds.
 
-    Whether fits per time step are better is asked of the best shared one only.
+    Whether fits per time step are better is asked of the best shared one only, at `judged_steps`:
+    the share of its error that they leave there is taken for that of all time steps.
     """
 
     def given(judges: Moments, every: Moments) -> Moments:
@@ -124,11 +128,14 @@ def _held_out(
     scores = dict(zip(choices, r2.tolist(), strict=True))
     if settings.per_time == "never":
         return scores
-    best, error = int(r2.argmax()), 0.0
-    for k, fold in enumerate(folds):  # not all at once: moments of every time step fill the memory
-        each = _fit_each(given(fold, whole), fits[best, k], settings)
-        error += float(fold.error(each).sum())
-    return {**scores, choices[best]._replace(per_time=True): 1 - error / spread}
+    best, times, errors = int(r2.argmax()), judged_steps(len(whole.n)), r2.new_zeros(2)
+    near = [_near(fold, times, settings.width) for fold in folds]
+    every = reduce(Moments.plus, near)
+    for fold, own, shared in zip(folds, near, fits[best], strict=True):
+        each, judge = _fit_each(given(own, every), shared), fold.each(itemgetter(times))
+        errors += torch.stack([judge.error(w).sum() for w in (each, shared)])
+    left = float(errors[0] / errors[1].clamp_min(1e-12))
+    return {**scores, choices[best]._replace(per_time=True): 1 - left * (1 - float(r2[best]))}
 
 
 def _fit_shared(
@@ -147,7 +154,8 @@ def _fit_shared(
     if support is not None:
         samples = samples.plus(support.each(lambda part: _times(older, part)))
     mean = samples.mean()
-    penalty = ridge.clamp_min(LEAST_RIDGE).unsqueeze(-1) * squares(mean.xy.shape[-1]).to(mean.xy)
+    size = quadratics.squares(mean.xy.shape[-1]).to(mean.xy)
+    penalty = ridge.clamp_min(LEAST_RIDGE).unsqueeze(-1) * size
     if settings.optimiser == "sgd":
         return descended(mean, penalty)
     return least_squares(mean, penalty, torch.zeros_like(mean.xy), ROUNDS)
@@ -157,21 +165,21 @@ def _times(weight: Float[Tensor, "*k"], part: Float[Tensor, "*q"]) -> Float[Tens
     return weight.view(*weight.shape, *(1,) * part.ndim) * part
 
 
-def _fit_each(
-    moments: Moments, shared: Float[Tensor, " q"], settings: CostFit
-) -> Float[Tensor, "T q"]:
-    """One fit a time step, the axis of the moments; neighbours count with a Gaussian weight.
+def _near(moments: Moments, times: Int[Tensor, " times"], width: float) -> Moments:
+    """Of time steps with their neighbours, which count with a Gaussian weight."""
+    distance = (times[:, None] - torch.arange(len(moments.n))).abs()
+    weight = torch.exp(-0.5 * (distance / width).square())
+    weight = (weight * (distance <= max(1, round(2 * width)))).to(moments.xx)
+    return moments.each(lambda part: torch.tensordot(weight, part, dims=([1], [0])))
+
+
+def _fit_each(near: Moments, shared: Float[Tensor, " q"]) -> Float[Tensor, "times q"]:
+    """One fit a time step, the axis of the moments.
 
     A time step far from all samples gets the shared fit.
     """
-    times = torch.arange(len(moments.n), device=moments.n.device)
-    distance = (times[:, None] - times).abs()
-    reach = max(1, round(2 * settings.width))
-    weight = torch.exp(-0.5 * (distance / settings.width).square()) * (distance <= reach)
-    weight = weight.to(moments.xx)
-    own = moments.each(lambda part: torch.tensordot(weight, part, dims=([1], [0]))).mean()
-    penalty = PULL * squares(len(shared)).to(shared).clamp_min(1.0)
-    return least_squares(own, penalty, shared, rounds=0)
+    penalty = PULL * quadratics.squares(len(shared)).to(shared).clamp_min(1.0)
+    return least_squares(near.mean(), penalty, shared, rounds=0)
 
 
 def _assembled(
@@ -188,7 +196,7 @@ def _assembled(
     C = states.z.new_zeros(horizon + 1, d + a, d + a)
     c = states.z.new_zeros(horizon + 1, d + a)
     b = states.z.new_zeros(horizon + 1)
-    C[:-1, :features, :features] = scale * curvature(w)
+    C[:-1, :features, :features] = scale * quadratics.curvature(w)
     c[:-1, :features] = scale * w[..., -features - 1 : -1]
     b[:-1] = scale * w[..., -1] + mean
     C[-1], c[-1], b[-1] = (terminal * part[-2] for part in (C, c, b))

@@ -6,10 +6,21 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from solar_cli.episodes import Episodes
+
+JUDGED_STEPS = 25
+
+
+def judged_steps(steps: int) -> Int[Tensor, " judged"]:
+    """Time steps that alternatives are compared at: 25 or more of ``steps``, evenly spaced.
+
+    Neighbouring steps say nearly the same, and every one that is fitted costs time.
+    """
+    stride = max(1, steps // JUDGED_STEPS)
+    return torch.arange(stride // 2, steps, stride)
 
 
 class Transitions(NamedTuple):
@@ -25,6 +36,15 @@ class Transitions(NamedTuple):
     def of(self, episodes: Tensor) -> Transitions:
         """Those of some episodes."""
         return Transitions(*(part[:, episodes] for part in self))
+
+    def at(self, times: Int[Tensor, " times"]) -> Transitions:
+        """Those of some time steps; where no episode was running, of the last that one lived in."""
+        steps = self.steps(times)
+        return Transitions(*(part[steps] for part in self))
+
+    def steps(self, times: Int[Tensor, " times"]) -> Int[Tensor, " times"]:
+        """The time steps whose samples tell of ``times``."""
+        return times.clamp(max=self.sampled - 1)
 
     @property
     def sampled(self) -> int:

@@ -27,17 +27,18 @@ from solar_cli.experiment.checkpointing import Checkpoints
 from solar_cli.experiment.exhibits import SHOWN, exhibit
 from solar_cli.experiment.judge import Judge, measured
 from solar_cli.experiment.messages import Message
-from solar_cli.experiment.stopwatch import Stopwatch
 from solar_cli.experiment.watched import WatchedTask
 from solar_cli.methods import Diverged, Learner
 from solar_cli.settings import Cell, load, method
+from solar_cli.stopwatch import Stopwatch
 from solar_cli.store.records import CheckpointRecord, Metric
 from solar_cli.store.store import Store
 from solar_cli.streams import Streams
 from solar_cli.wording import counted
 
-TRAINING = ("seconds_training", "seconds_discarded")
-"""metrics of a method that trains networks: of what it kept, and of what it threw away"""
+TRAINING = ("seconds_training", "seconds_discarded", "seconds_judging")
+"""metrics of a method that trains networks: of what it kept, of what it threw away, and of looking
+at what came of it"""
 
 log = logging.getLogger(__name__)
 

@@ -4,8 +4,11 @@ A Gaussian mixture over the points (x, u, x') of all time steps tells what trans
 general; at each time step the clusters that explain its points give a normal-inverse-Wishart prior;
 the joint Gaussian fitted under it, conditioned on (x, u), is the affine linear-Gaussian dynamics.
 
+EM's two steps are one matrix product each with the monomials of the points: a log density is a
+quadratic, and scatters are sums of products.
+
 Axes: K clusters, P points in all, T time steps, N points a time step, D = p + d dimensions of a
-point (p regressors, then d outputs). float64.
+point (p regressors, then d outputs), q monomials of one. float64.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from solar_cli.inference import cholesky
+from solar_cli.inference import cholesky, quadratics
 
 # The numbers are the defaults of gps (cbfinn/gps), but for the ridge: it is relative to the data's
 # own variances here, so that a change of units changes nothing.
@@ -36,6 +39,11 @@ class GaussianMixture(NamedTuple):
     means: Float[Tensor, "K D"]
     covariances: Float[Tensor, "K D D"]
     points: int
+
+    def changed(self, offset: Float[Tensor, " D"], scale: Float[Tensor, " D"]) -> GaussianMixture:
+        """The mixture of offset + scale x, where this one is of x."""
+        covariances = self.covariances * scale[:, None] * scale
+        return self._replace(means=offset + scale * self.means, covariances=covariances)
 
 
 class MixtureFit(NamedTuple):
@@ -84,28 +92,34 @@ def fit_mixture(
     posterior under it.
     """
     points = points.double()
-    scale = _dimension_variance(points)
+    centre, scale = points.mean(0), _dimension_variance(points).sqrt()
+    standard = (points - centre) / scale
+    x = quadratics.monomials(standard)
     pseudo_counts = COVARIANCE_RIDGE * len(points) / clusters
-    responsibility = _seed_responsibilities(points / scale.sqrt(), clusters, generator)
+    responsibility = _seed_responsibilities(standard, clusters, generator)
     log_posterior: list[float] = []
     for _ in range(ITERATIONS):
-        mixture = _maximise(points, responsibility, scale, pseudo_counts)
-        joint = _log_joint(mixture, points)
-        prior = _log_prior(mixture, scale, pseudo_counts)
-        log_posterior.append(float(joint.logsumexp(-1).sum() + prior))
+        mixture = _maximise(x, responsibility, pseudo_counts)
+        joint = x @ _log_joint(mixture).mT
+        log_likelihood = joint.logsumexp(-1).sum() - len(points) * scale.log().sum()
+        log_posterior.append(float(log_likelihood + _log_prior(mixture, pseudo_counts)))
         if len(log_posterior) > 1 and (
             log_posterior[-1] - log_posterior[-2] < TOLERANCE * len(points)
         ):
             break
         responsibility = joint.softmax(-1)
-    return MixtureFit(mixture, log_posterior)
+    return MixtureFit(mixture.changed(centre, scale), log_posterior)
 
 
 def responsibilities(
     mixture: GaussianMixture, points: Float[Tensor, "*batch D"]
 ) -> Float[Tensor, "*batch K"]:
     """Posterior probability of each cluster at each point."""
-    return _log_joint(mixture, points.double()).softmax(-1)
+    centre = mixture.weights @ mixture.means
+    scale = mixture.covariances.diagonal(dim1=-2, dim2=-1).amax(0).sqrt()
+    standard = mixture.changed(-centre / scale, 1 / scale)
+    x = quadratics.monomials((points.double() - centre) / scale)
+    return (x @ _log_joint(standard).mT).softmax(-1)
 
 
 def local_prior(
@@ -192,39 +206,32 @@ def _seed_responsibilities(
 
 
 def _maximise(
-    points: Float[Tensor, "P D"],
-    responsibility: Float[Tensor, "P K"],
-    scale: Float[Tensor, " D"],
-    pseudo_counts: float,
+    x: Float[Tensor, "P q"], responsibility: Float[Tensor, "P K"], pseudo_counts: float
 ) -> GaussianMixture:
-    """M step: weights, means, and the posterior mode of the covariances."""
-    counts = responsibility.sum(0).clamp(min=torch.finfo(points.dtype).tiny)
-    means = responsibility.mT @ points / counts[:, None]
-    deviation = points - means[:, None]
-    scatter = (responsibility.mT[..., None] * deviation).mT @ deviation
-    prior = pseudo_counts * torch.diag(scale)
+    """M step of standardised points: weights, means, and the posterior mode of the covariances."""
+    sums = responsibility.mT @ x
+    counts = sums[:, -1].clamp(min=torch.finfo(x.dtype).tiny)
+    means = sums[:, -1 - quadratics.features(x.shape[-1]) : -1] / counts[:, None]
+    scatter = quadratics.outer(sums) - counts[:, None, None] * means[..., None] * means[:, None]
+    prior = pseudo_counts * torch.eye(means.shape[-1]).to(x)
     covariances = (scatter + prior) / (counts + pseudo_counts)[:, None, None]
-    return GaussianMixture(counts / counts.sum(), means, covariances, len(points))
+    return GaussianMixture(counts / counts.sum(), means, covariances, len(x))
 
 
-def _log_joint(
-    mixture: GaussianMixture, points: Float[Tensor, "*batch D"]
-) -> Float[Tensor, "*batch K"]:
-    """log (weight_k N(point | cluster k))."""
+def _log_joint(mixture: GaussianMixture) -> Float[Tensor, "K q"]:
+    """log (weight_k N(point | cluster k)), as weights of the point's monomials."""
     factor = torch.linalg.cholesky(mixture.covariances)
-    whitening = cholesky.inverse_factor(factor)
-    deviation = points[..., None, :] - mixture.means
-    squared = torch.einsum("kij,...kj->...ki", whitening, deviation).square().sum(-1)
-    log_det = cholesky.log_determinant(factor)
-    constant = points.shape[-1] * math.log(2 * math.pi)
-    return mixture.weights.log() - (squared + log_det + constant) / 2
+    precision = torch.cholesky_inverse(factor)
+    slope = (precision @ mixture.means[..., None])[..., 0]
+    constant = mixture.means.shape[-1] * math.log(2 * math.pi) + cholesky.log_determinant(factor)
+    at_zero = mixture.weights.log() - (constant + (slope * mixture.means).sum(-1)) / 2
+    return quadratics.coefficients(-precision, torch.cat([slope, at_zero[:, None]], dim=-1))
 
 
-def _log_prior(
-    mixture: GaussianMixture, scale: Float[Tensor, " D"], pseudo_counts: float
-) -> Tensor:
-    """Log density of the covariances under their inverse-Wishart prior, up to a constant."""
+def _log_prior(mixture: GaussianMixture, pseudo_counts: float) -> Tensor:
+    """Log density of the covariances of standardised points under their inverse-Wishart prior, up
+    to a constant.
+    """
     factor = torch.linalg.cholesky(mixture.covariances)
-    log_det = cholesky.log_determinant(factor)
     inverse = torch.cholesky_inverse(factor).diagonal(dim1=-2, dim2=-1)
-    return (log_det + (inverse * scale).sum(-1)).sum().mul(-pseudo_counts / 2)
+    return (cholesky.log_determinant(factor) + inverse.sum(-1)).sum().mul(-pseudo_counts / 2)

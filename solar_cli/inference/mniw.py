@@ -17,7 +17,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from solar_cli.inference import cholesky, inverse_wishart
@@ -47,6 +47,12 @@ class RegressionStatistics(NamedTuple):
         return RegressionStatistics(
             self.yy * matrix, self.yx * matrix, self.xx * matrix, self.n * w
         )
+
+    def at(self, members: Int[Tensor, " some"]) -> RegressionStatistics:
+        """Some members of the last batch axis, which parts that are of all do not have."""
+        yy, yx, xx = (part if part.ndim == 2 else part[..., members, :, :] for part in self[:3])
+        n = self.n if self.n.ndim == 0 else self.n[..., members]
+        return RegressionStatistics(yy, yx, xx, n)
 
 
 class MNIW(NamedTuple):

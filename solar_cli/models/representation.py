@@ -30,6 +30,7 @@ from solar_cli.models.training import Trainer
 from solar_cli.pulse import Pulse
 from solar_cli.settings import TaskSettings
 from solar_cli.settings.local import LatentMethod
+from solar_cli.stopwatch import Stopwatch
 from solar_cli.streams import Streams
 
 ACTIVE_SHARE = 0.9  # of a latent's variance that its mean must carry for it to count as active
@@ -84,6 +85,7 @@ class Representation:
         self._before: Candidate | None = None  # what a fine-tuning under way started from
         self._candidates: list[Candidate] = []
         self._latents: dict[Batch, Segments] = {}  # of the networks as they are
+        self._watch = Stopwatch()
 
     @property
     def trained(self) -> bool:
@@ -124,14 +126,17 @@ class Representation:
     def update(self, experience: Experience) -> dict[str, float]:
         """MODELUPDATE (Algorithm 1, line 5): train on the batches of the last B iterations."""
         newest, recent = experience.recent(1), experience.recent(self.settings.training.buffer)
-        if not self._trained:
-            metrics = self._train_first(experience.iteration, newest)
-        elif self.settings.training.fine_tune_steps:
-            metrics = self._fine_tune(experience.iteration, newest, recent)
-        else:
-            metrics = self._judge(newest)
-            self._conclude(recent)
-        return {**metrics, **self._model.prior.metrics()}
+        self._watch.go_on_from({})
+        with self._watch.running("judging"):
+            if not self._trained:
+                metrics = self._train_first(experience.iteration, newest)
+            elif self.settings.training.fine_tune_steps:
+                metrics = self._fine_tune(experience.iteration, newest, recent)
+            else:
+                metrics = self._judge(newest)
+                self._conclude(recent)
+        seconds = {"seconds_judging": self._watch.seconds()["judging"]}
+        return {**metrics, **self._model.prior.metrics(), **seconds}
 
     def _train_first(self, iteration: int, batches: list[Episodes]) -> dict[str, float]:
         """Train until a representation is alive, or take the best of the attempts."""
@@ -145,7 +150,8 @@ class Representation:
                 self._model.networks.standardise_by(self._live_frames(learned))
             name = f"attempt {attempt}"
             self._latents.clear()
-            terms = self._trainer.fit(name, self._model, [learned], training.steps)
+            with self._watch.running("training"):  # which measures itself, its interruptions too
+                terms = self._trainer.fit(name, self._model, [learned], training.steps)
             encoded = self._encoded(batches).of(slice(-kept))
             self._model.prior.conclude(encoded)
             self._model.prior.settle()
@@ -186,7 +192,8 @@ class Representation:
         name = f"iteration {iteration}"
         self._latents.clear()
         count = sum(len(episodes) for episodes in newest)
-        terms = self._trainer.fit(name, self._model, recent, steps, newest=count)
+        with self._watch.running("training"):
+            terms = self._trainer.fit(name, self._model, recent, steps, newest=count)
         self._before = None
         self._conclude(recent)
         kills = self._alive(before.metrics) and not self._alive(self._judge(newest))

@@ -14,7 +14,8 @@ import pytest
 import torch
 from bench_training import hardware
 
-from solar_cli.control.convex_quadratic import Moments, least_squares, squares
+from solar_cli.control.convex_quadratic import Moments, least_squares
+from solar_cli.inference.quadratics import squares
 
 ROUNDS, ITERATIONS, REPEATS = 30, 100, 3
 RIDGES = (1e-6, 1e-4, 1e-2, 0.1, 1.0)

@@ -5,13 +5,8 @@ import pytest
 import torch
 from scipy.optimize import minimize
 
-from solar_cli.control.convex_quadratic import (
-    Moments,
-    curvature,
-    descended,
-    least_squares,
-    squares,
-)
+from solar_cli.control.convex_quadratic import Moments, descended, least_squares
+from solar_cli.inference.quadratics import curvature, squares
 
 ROUNDS = 300
 """enough to converge"""

@@ -131,7 +131,7 @@ def test_where_no_episode_lives_the_last_dynamics_go_on(method):
     for part in (model.F, model.f, model.Sigma):
         assert not torch.equal(part[2], part[3])
         for t in range(4, T):
-            assert torch.equal(part[t], part[3])
+            torch.testing.assert_close(part[t], part[3], rtol=1e-12, atol=1e-15)
 
 
 def test_held_out_scores_are_those_of_live_steps():

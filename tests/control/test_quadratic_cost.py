@@ -5,6 +5,7 @@ import pytest
 import torch
 from predicted_costs import r2
 
+from solar_cli.control import trajectories
 from solar_cli.control.quadratic_cost import FOLDS, PULL, fit_quadratic_cost
 from solar_cli.control.trajectories import Trajectories
 from solar_cli.settings.local import CostFit
@@ -68,6 +69,15 @@ def regression(design, y, penalty, towards):
     """w of the least mean squared error + penalty (w - towards)^2."""
     left = design.T @ design / len(design) + np.diag(penalty)
     return np.linalg.solve(left, design.T @ y / len(design) + penalty * towards)
+
+
+def regression_per_time_step(design, y, t, width, shared):
+    """Its w: samples of neighbouring steps weigh as a Gaussian, and it is pulled to ``shared``."""
+    distance = np.abs(np.arange(T) - t)
+    weight = np.exp(-0.5 * np.square(distance / width)) * (distance <= max(1, round(2 * width)))
+    root = np.sqrt(weight / weight.sum() * T)
+    pull = PULL * np.maximum(PENALTY, 1)
+    return regression(rows(root[:, None] * design), (root * y).ravel(), pull, shared)
 
 
 # What is known is found
@@ -252,9 +262,7 @@ def test_a_good_representation_is_not_taken_for_a_dead_one(seed):
 
 
 def test_a_fit_per_time_step_is_a_weighted_regression_on_monomials():
-    """Of standardised costs, pulled to the regression on all time steps; samples of neighbouring
-    steps weigh as a Gaussian. Where that is convex, it is what is found.
-    """
+    """Of standardised costs. Where that is convex, it is what is found."""
     width, states = 1.3, batch(varying, episodes=200, noise=0.3)
     y, mean, scale = standardised(states)
     design = monomials(states)
@@ -262,15 +270,33 @@ def test_a_fit_per_time_step_is_a_weighted_regression_on_monomials():
     found = fit(states, width=width, ridge=(1e-6,))
     assert found.choice.per_time
     for t in range(T):
-        distance = np.abs(np.arange(T) - t)
-        weight = np.exp(-0.5 * np.square(distance / width)) * (distance <= 3)
-        root = np.sqrt(weight / weight.sum() * T)
-        pull = PULL * np.maximum(PENALTY, 1)
-        w = regression(rows(root[:, None] * design), (root * y).ravel(), pull, shared)
+        w = regression_per_time_step(design, y, t, width, shared)
         assert np.linalg.eigvalsh(curvature(w)).min() > 0.02
         np.testing.assert_allclose(found.model.C[t, :m, :m], scale * curvature(w), atol=1e-6)
         np.testing.assert_allclose(found.model.c[t, :m], scale * w[-m - 1 : -1], atol=1e-6)
         np.testing.assert_allclose(found.model.b[t], scale * w[-1] + mean, atol=1e-6)
+
+
+def test_fits_per_time_step_are_judged_at_some_steps(monkeypatch):
+    """What they leave there of the shared fits' error is taken for what they leave of all of it."""
+    monkeypatch.setattr(trajectories, "JUDGED_STEPS", 2)
+    width, states = 1.3, batch(varying, episodes=200, noise=0.3)
+    y, design = standardised(states)[0], monomials(states)
+    fold = np.arange(len(y)) % FOLDS
+    of_all, of_some, left = 0.0, 0.0, 0.0
+    for k in range(FOLDS):
+        learned, judge = fold != k, fold == k
+        made_of = design[learned], y[learned]
+        shared = regression(*map(np.concatenate, made_of), 1e-6 * PENALTY, np.zeros(len(PENALTY)))
+        wrong = np.square(design[judge] @ shared - y[judge])
+        of_all, of_some = of_all + wrong.sum(), of_some + wrong[:, [1, 4]].sum()
+        for t in (1, 4):
+            w = regression_per_time_step(*made_of, t, width, shared)
+            left += np.square(design[judge, t] @ w - y[judge, t]).sum()
+    found = fit(states, width=width, ridge=(1e-6,))
+    assert found.choice.per_time
+    expected = 1 - of_all / np.square(y).sum() * left / of_some
+    assert found.r2 == pytest.approx(expected, abs=1e-6)
 
 
 def flat(z, t):
