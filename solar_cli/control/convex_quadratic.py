@@ -49,7 +49,7 @@ class Moments(NamedTuple):
         return Moments(*map(torch.stack, zip(*parts, strict=True)))
 
     def error(self, w: Float[Tensor, "*k q"]) -> Float[Tensor, "*k"]:
-        """Sum of squared errors of coefficients."""
+        """Sum of squared errors of weights of monomials."""
         return _inner(w, _product(self.xx, w) - 2 * self.xy) + self.yy
 
     def each(self, change: Callable[[Tensor], Tensor]) -> Moments:
@@ -80,7 +80,7 @@ def least_squares(
     towards: Float[Tensor, "*#k q"],
     rounds: int,
 ) -> Float[Tensor, "*k q"]:
-    """Coefficients w of the least mean squared error + penalty (w - towards)^2 with C >= 0.
+    """Weights w of the least mean squared error + penalty (w - towards)^2 with C >= 0.
 
     Without that condition it is a linear system. What is negative of its C is cut off, and
     ``rounds`` of the alternating direction method of multipliers (Boyd et al. 2011, section 5) find
@@ -103,10 +103,10 @@ def least_squares(
         factor = torch.linalg.cholesky(A + torch.diag_embed(coupling))
     for _ in range(rounds):
         dual = dual + C - split
-        wanted = quadratics.coefficients(split - dual, torch.zeros_like(b[..., second:]))
+        wanted = quadratics.weights(split - dual, torch.zeros_like(b[..., second:]))
         C = quadratics.curvature(_divided(b + coupling * wanted, factor))
         split = _nonnegative(C + dual)
-    curved = quadratics.coefficients(split, b[..., :0])
+    curved = quadratics.weights(split, b[..., :0])
     left = b[..., second:] - _product(A[..., second:, :second], curved)
     rest = _divided(left, torch.linalg.cholesky(A[..., second:, second:]))
     return torch.cat([curved, rest], dim=-1)
@@ -123,19 +123,19 @@ def descended(mean: Moments, penalty: Float[Tensor, "*#k q"]) -> Float[Tensor, "
     parameters = [L.requires_grad_(), rest.requires_grad_()]
     optimiser = torch.optim.SGD(parameters, SGD_RATE, momentum=0.9)
 
-    def parametrised() -> Tensor:
+    def weights() -> Tensor:
         diagonal = torch.nn.functional.softplus(torch.diagonal(L, dim1=-2, dim2=-1))
         cholesky = L.tril(-1) + torch.diag_embed(diagonal)
-        return quadratics.coefficients(cholesky @ cholesky.mT, rest)
+        return quadratics.weights(cholesky @ cholesky.mT, rest)
 
     for _ in range(SGD_STEPS):
-        w = parametrised()
+        w = weights()
         loss = (mean.error(w) + _inner(penalty, w.square())).sum()
         optimiser.zero_grad()
         torch.autograd.backward(loss)
         optimiser.step()
     with torch.no_grad():
-        return parametrised()
+        return weights()
 
 
 def _divided(b: Float[Tensor, "*k q"], factor: Float[Tensor, "*k q q"]) -> Float[Tensor, "*k q"]:

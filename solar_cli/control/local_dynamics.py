@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from solar_cli.control.linear_gaussian import LinearDynamics
-from solar_cli.control.trajectories import Trajectories, Transitions, judged_steps
+from solar_cli.control.trajectories import Trajectories, Transitions, compared_steps
 from solar_cli.inference import cholesky, gmm, mniw
 from solar_cli.models.priors import LatentPrior
 from solar_cli.settings.local import LocalFit
@@ -98,7 +98,7 @@ def infer_dynamics(
 class _Score(NamedTuple):
     """One-step prediction on folds that were left out of the fit, of each alternative.
 
-    At some time steps, `judged_steps`.
+    Only `compared_steps` count.
     """
 
     log_likelihood: Float[Tensor, "*k"]
@@ -108,7 +108,7 @@ class _Score(NamedTuple):
 
 
 def _held_out(fit: Fit, samples: Transitions, folds: int) -> _Score:
-    count, times = samples.live.shape[1], judged_steps(samples.sampled)
+    count, times = samples.live.shape[1], compared_steps(samples.live.sum(dim=1))
     fold, judged = torch.arange(count) % min(folds, count), samples.at(times)
     likelihood = squared = samples.y.new_zeros(())
     for k in range(int(fold.max()) + 1):

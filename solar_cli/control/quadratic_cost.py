@@ -23,7 +23,7 @@ from torch import Tensor
 
 from solar_cli.control.convex_quadratic import Moments, descended, least_squares
 from solar_cli.control.linear_gaussian import QuadraticCost
-from solar_cli.control.trajectories import Trajectories, judged_steps
+from solar_cli.control.trajectories import Trajectories, compared_steps
 from solar_cli.inference import quadratics
 from solar_cli.settings.local import CostFit
 
@@ -53,7 +53,8 @@ class FittedCost(NamedTuple):
 
     model: QuadraticCost
     r2: float
-    """share of the variance of held-out costs that is explained"""
+    """share of the variance of held-out costs that is explained; where fits per time step won, an
+    estimate from some time steps"""
     choice: Choice
 
     @property
@@ -109,8 +110,8 @@ def _held_out(
 ) -> dict[Choice, float]:
     """R2 of every choice on the episodes that a fit was not given; ``whole`` is of all folds.
 
-    Whether fits per time step are better is asked of the best shared one only, at `judged_steps`:
-    the share of its error that they leave there is taken for that of all time steps.
+    Fits per time step are compared with the best shared one at `compared_steps`. Their error in
+    all is taken to be its error in all, times the ratio of both at these steps.
     """
 
     def given(judges: Moments, every: Moments) -> Moments:
@@ -128,7 +129,7 @@ def _held_out(
     scores = dict(zip(choices, r2.tolist(), strict=True))
     if settings.per_time == "never":
         return scores
-    best, times, errors = int(r2.argmax()), judged_steps(len(whole.n)), r2.new_zeros(2)
+    best, times, errors = int(r2.argmax()), compared_steps(whole.n), r2.new_zeros(2)
     near = [_near(fold, times, settings.width) for fold in folds]
     every = reduce(Moments.plus, near)
     for fold, own, shared in zip(folds, near, fits[best], strict=True):

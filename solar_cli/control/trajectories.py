@@ -11,16 +11,22 @@ from torch import Tensor
 
 from solar_cli.episodes import Episodes
 
-JUDGED_STEPS = 25
+MOST_COMPARED = 40
+"""time steps. With a quarter of the car's 100, held-out R2 of its dynamics was off by up to .16."""
 
 
-def judged_steps(steps: int) -> Int[Tensor, " judged"]:
-    """Time steps that alternatives are compared at: 25 or more of ``steps``, evenly spaced.
+def compared_steps(counts: Float[Tensor, " T"]) -> Int[Tensor, " compared"]:
+    """Time steps that alternatives are compared at, given how many samples each step has.
 
-    Neighbouring steps say nearly the same, and every one that is fitted costs time.
+    All that have any, or of many those that divide the samples evenly, with the first and the last:
+    neighbouring steps say nearly the same, and a fit of each of them takes its time.
     """
-    stride = max(1, steps // JUDGED_STEPS)
-    return torch.arange(stride // 2, steps, stride)
+    sampled, before = int((counts > 0).sum()), counts.cumsum(dim=0)
+    if sampled <= MOST_COMPARED:
+        return torch.arange(sampled)
+    evenly = torch.linspace(1, float(before[-1]), MOST_COMPARED, dtype=torch.float64)
+    steps: Tensor = torch.unique(torch.searchsorted(before.double(), evenly))
+    return steps
 
 
 class Transitions(NamedTuple):

@@ -37,8 +37,8 @@ from solar_cli.streams import Streams
 from solar_cli.wording import counted
 
 TRAINING = ("seconds_training", "seconds_discarded", "seconds_judging")
-"""metrics of a method that trains networks: of what it kept, of what it threw away, and of looking
-at what came of it"""
+"""metrics of a method that trains networks: of what it kept, of what it threw away, and of encoding
+episodes and judging the model by them"""
 
 log = logging.getLogger(__name__)
 

@@ -5,7 +5,8 @@ general; at each time step the clusters that explain its points give a normal-in
 the joint Gaussian fitted under it, conditioned on (x, u), is the affine linear-Gaussian dynamics.
 
 EM's two steps are one matrix product each with the monomials of the points: a log density is a
-quadratic, and scatters are sums of products.
+quadratic, and scatters are sums of products. Points are centred first: far from zero, what a
+quadratic is made of cancels, and its digits are lost.
 
 Axes: K clusters, P points in all, T time steps, N points a time step, D = p + d dimensions of a
 point (p regressors, then d outputs), q monomials of one. float64.
@@ -39,11 +40,6 @@ class GaussianMixture(NamedTuple):
     means: Float[Tensor, "K D"]
     covariances: Float[Tensor, "K D D"]
     points: int
-
-    def changed(self, offset: Float[Tensor, " D"], scale: Float[Tensor, " D"]) -> GaussianMixture:
-        """The mixture of offset + scale x, where this one is of x."""
-        covariances = self.covariances * scale[:, None] * scale
-        return self._replace(means=offset + scale * self.means, covariances=covariances)
 
 
 class MixtureFit(NamedTuple):
@@ -108,7 +104,11 @@ def fit_mixture(
         ):
             break
         responsibility = joint.softmax(-1)
-    return MixtureFit(mixture.changed(centre, scale), log_posterior)
+    mixture = mixture._replace(
+        means=centre + scale * mixture.means,
+        covariances=scale[:, None] * mixture.covariances * scale,
+    )
+    return MixtureFit(mixture, log_posterior)
 
 
 def responsibilities(
@@ -116,10 +116,8 @@ def responsibilities(
 ) -> Float[Tensor, "*batch K"]:
     """Posterior probability of each cluster at each point."""
     centre = mixture.weights @ mixture.means
-    scale = mixture.covariances.diagonal(dim1=-2, dim2=-1).amax(0).sqrt()
-    standard = mixture.changed(-centre / scale, 1 / scale)
-    x = quadratics.monomials((points.double() - centre) / scale)
-    return (x @ _log_joint(standard).mT).softmax(-1)
+    x = quadratics.monomials(points.double() - centre)
+    return (x @ _log_joint(mixture._replace(means=mixture.means - centre)).mT).softmax(-1)
 
 
 def local_prior(
@@ -225,7 +223,7 @@ def _log_joint(mixture: GaussianMixture) -> Float[Tensor, "K q"]:
     slope = (precision @ mixture.means[..., None])[..., 0]
     constant = mixture.means.shape[-1] * math.log(2 * math.pi) + cholesky.log_determinant(factor)
     at_zero = mixture.weights.log() - (constant + (slope * mixture.means).sum(-1)) / 2
-    return quadratics.coefficients(-precision, torch.cat([slope, at_zero[:, None]], dim=-1))
+    return quadratics.weights(-precision, torch.cat([slope, at_zero[:, None]], dim=-1))
 
 
 def _log_prior(mixture: GaussianMixture, pseudo_counts: float) -> Tensor:

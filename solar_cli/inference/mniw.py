@@ -49,7 +49,7 @@ class RegressionStatistics(NamedTuple):
         )
 
     def at(self, members: Int[Tensor, " some"]) -> RegressionStatistics:
-        """Some members of the last batch axis, which parts that are of all do not have."""
+        """Those of some members of the last batch axis; a part without it is of every member."""
         yy, yx, xx = (part if part.ndim == 2 else part[..., members, :, :] for part in self[:3])
         n = self.n if self.n.ndim == 0 else self.n[..., members]
         return RegressionStatistics(yy, yx, xx, n)

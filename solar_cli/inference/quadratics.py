@@ -38,7 +38,7 @@ def outer(sums: Float[Tensor, "*k q"]) -> Float[Tensor, "*k m m"]:
     return doubled - torch.diag_embed(0.5 * doubled.diagonal(dim1=-2, dim2=-1))
 
 
-def coefficients(C: Float[Tensor, "*k m m"], rest: Float[Tensor, "*k m1"]) -> Float[Tensor, "*k q"]:
+def weights(C: Float[Tensor, "*k m m"], rest: Float[Tensor, "*k m1"]) -> Float[Tensor, "*k q"]:
     """Weights of `monomials`, of which ``rest`` are the last ones, [c; b]."""
     i, j = torch.tril_indices(*C.shape[-2:])
     halves = torch.where(i == j, 0.5, 1.0).to(C)
@@ -46,7 +46,7 @@ def coefficients(C: Float[Tensor, "*k m m"], rest: Float[Tensor, "*k m1"]) -> Fl
 
 
 def squares(q: int) -> Float[Tensor, " q"]:
-    """Of squared coefficients in |C|^2 / 2 + |c|^2."""
+    """What each w_q^2 is multiplied by in |C|^2 / 2 + |c|^2, a sum of squared coefficients."""
     m = features(q)
     i, j = torch.tril_indices(m, m)
     return torch.cat([torch.where(i == j, 2.0, 1.0), torch.ones(m), torch.zeros(1)])

@@ -85,7 +85,7 @@ class Representation:
         self._before: Candidate | None = None  # what a fine-tuning under way started from
         self._candidates: list[Candidate] = []
         self._latents: dict[Batch, Segments] = {}  # of the networks as they are
-        self._watch = Stopwatch()
+        self._watch = Stopwatch()  # of judging in this process: networks on collected episodes
 
     @property
     def trained(self) -> bool:
@@ -127,14 +127,13 @@ class Representation:
         """MODELUPDATE (Algorithm 1, line 5): train on the batches of the last B iterations."""
         newest, recent = experience.recent(1), experience.recent(self.settings.training.buffer)
         self._watch.go_on_from({})
-        with self._watch.running("judging"):
-            if not self._trained:
-                metrics = self._train_first(experience.iteration, newest)
-            elif self.settings.training.fine_tune_steps:
-                metrics = self._fine_tune(experience.iteration, newest, recent)
-            else:
-                metrics = self._judge(newest)
-                self._conclude(recent)
+        if not self._trained:
+            metrics = self._train_first(experience.iteration, newest)
+        elif self.settings.training.fine_tune_steps:
+            metrics = self._fine_tune(experience.iteration, newest, recent)
+        else:
+            metrics = self._judge(newest)
+            self._conclude(recent)
         seconds = {"seconds_judging": self._watch.seconds()["judging"]}
         return {**metrics, **self._model.prior.metrics(), **seconds}
 
@@ -150,8 +149,7 @@ class Representation:
                 self._model.networks.standardise_by(self._live_frames(learned))
             name = f"attempt {attempt}"
             self._latents.clear()
-            with self._watch.running("training"):  # which measures itself, its interruptions too
-                terms = self._trainer.fit(name, self._model, [learned], training.steps)
+            terms = self._trainer.fit(name, self._model, [learned], training.steps)
             encoded = self._encoded(batches).of(slice(-kept))
             self._model.prior.conclude(encoded)
             self._model.prior.settle()
@@ -192,8 +190,7 @@ class Representation:
         name = f"iteration {iteration}"
         self._latents.clear()
         count = sum(len(episodes) for episodes in newest)
-        with self._watch.running("training"):
-            terms = self._trainer.fit(name, self._model, recent, steps, newest=count)
+        terms = self._trainer.fit(name, self._model, recent, steps, newest=count)
         self._before = None
         self._conclude(recent)
         kills = self._alive(before.metrics) and not self._alive(self._judge(newest))
@@ -217,6 +214,10 @@ class Representation:
     @torch.no_grad()
     def _judge(self, batches: list[Episodes]) -> dict[str, float]:
         """What there is to watch, on collected episodes that the model has not been trained on."""
+        with self._watch.running("judging"):
+            return self._held_out_metrics(batches)
+
+    def _held_out_metrics(self, batches: list[Episodes]) -> dict[str, float]:
         model = self._model
         segments = model.prior.inferred(self._encoded(batches))
         mean, variance = segments.counted(segments.mean), segments.counted(segments.variance)
@@ -317,11 +318,13 @@ class Representation:
         return Segments.joined([self._encoded_by_batch(episodes) for episodes in batches])
 
     def _encoded_by_batch(self, episodes: Episodes) -> Segments:
-        if episodes.batch is None:
-            return self._model.encoded(episodes, self.device)
-        if episodes.batch not in self._latents:
-            self._latents[episodes.batch] = self._model.encoded(episodes, self.device)
-        return self._latents[episodes.batch]
+        if episodes.batch in self._latents:
+            return self._latents[episodes.batch]
+        with self._watch.running("judging"):
+            encoded = self._model.encoded(episodes, self.device)
+        if episodes.batch is not None:
+            self._latents[episodes.batch] = encoded
+        return encoded
 
     def _live_frames(self, episodes: Episodes) -> Float[Tensor, "n *frame"]:
         return torch.from_numpy(episodes.frames[episodes.live_frames]).to(self.device)

@@ -11,7 +11,7 @@ from solar_cli.store.store import Store
 ACTIVITIES = {
     "seconds_training": "training networks",
     "seconds_discarded": "trainings that were discarded",
-    "seconds_judging": "judging networks on collected episodes",
+    "seconds_judging": "encoding collected episodes and judging the model",
     "seconds_collecting": "collecting episodes",
     "seconds_control": "all else that the method does",
     "seconds_evaluating": "evaluating",

@@ -11,7 +11,7 @@ from solar_cli.control.linear_gaussian import LinearGaussianPolicy
 from solar_cli.control.linearise import linearise_policy
 from solar_cli.control.local_dynamics import ACTION_RIDGE, infer_dynamics
 from solar_cli.control.quadratic_cost import fit_quadratic_cost
-from solar_cli.control.trajectories import Trajectories
+from solar_cli.control.trajectories import Trajectories, compared_steps
 from solar_cli.models.basis import LatentBasis
 from solar_cli.models.priors import LatentPrior
 from solar_cli.settings.local import CostFit, LocalFit
@@ -134,8 +134,9 @@ def test_where_no_episode_lives_the_last_dynamics_go_on(method):
             torch.testing.assert_close(part[t], part[3], rtol=1e-12, atol=1e-15)
 
 
-def test_held_out_scores_are_those_of_live_steps():
-    states = ended(SOME, rubbish=1e3)
+@pytest.mark.parametrize("lengths", [SOME, EARLY])
+def test_held_out_scores_are_those_of_live_steps(lengths):
+    states = ended(lengths, rubbish=1e3)
     metrics = infer(states, method="regression", folds=2).metrics
     squared = total = likelihood = 0.0
     increments = np.concatenate([samples(states, t)[1] for t in range(T)])
@@ -144,7 +145,7 @@ def test_held_out_scores_are_those_of_live_steps():
         learned, judge = (Trajectories(*(part[k] for part in states)) for k in (~rows, rows))
         fitted = infer(learned, method="regression", folds=2).model
         F, f = of_increments(fitted)
-        for t in range(T):
+        for t in range(max(lengths)):
             x, y = samples(judge, t)
             residual = y - x @ F[t].T - f[t]
             Sigma = fitted.Sigma[t].numpy() * (1 + 1 / len(samples(learned, t)[0]))
@@ -193,6 +194,51 @@ def test_a_cost_far_from_all_live_steps_is_the_one_shared_by_all():
         assert float(found.C[t, 0, 0]) == pytest.approx(curvature, rel=0.2)
     for t in (10, 99):
         torch.testing.assert_close(found.C[t], shared.C[t], rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize(("horizon", "lived"), [(100, 2), (200, 3), (50, 1)])
+def test_noise_is_not_explained_by_fits_of_steps_that_nobody_lived(horizon, lived):
+    rng = np.random.default_rng(0)
+    z, actions = rng.normal(size=(N, horizon + 1, d)), np.zeros((N, horizon, a))
+    live = np.broadcast_to(np.arange(horizon) < lived, (N, horizon)).copy()
+    costs = rng.normal(size=(N, horizon))
+    states = Trajectories(*map(torch.as_tensor, (z, actions, actions, costs, live)))
+    assert fit_quadratic_cost(states, [], 0.0, CostFit(), d).r2 < 0.3
+
+
+def test_what_is_paid_at_the_end_is_fitted_per_time_step():
+    """The step that matters is among those that fits are compared at."""
+    rng = np.random.default_rng(0)
+    z, actions = rng.normal(size=(N, 101, d)), np.zeros((N, 100, a))
+    costs = np.square(z[:, :-1]).sum(axis=-1) * (np.arange(100) == 99)
+    states = Trajectories(*map(torch.as_tensor, (z, actions, actions, costs, costs > -1)))
+    assert fit_quadratic_cost(states, [], 0.0, CostFit(), d).choice.per_time
+
+
+# Time steps that alternatives are compared at
+
+
+def test_all_steps_that_have_samples_are_compared_where_they_are_few():
+    counts = torch.tensor([5.0] * 20 + [2.0] * 20 + [0.0] * 50)
+    assert compared_steps(counts).tolist() == list(range(40))
+
+
+@pytest.mark.parametrize("horizon", [41, 50, 100, 1000])
+def test_of_many_steps_those_compared_lie_evenly_from_the_first_to_the_last(horizon):
+    steps = compared_steps(torch.full((horizon,), 20.0))
+    assert len(steps) == 40
+    assert (int(steps[0]), int(steps[-1])) == (0, horizon - 1)
+    gaps = steps.diff()
+    assert int(gaps.max()) <= int(gaps.min()) + 1
+
+
+def test_compared_steps_are_where_samples_are():
+    """Twenty episodes live 18 steps, and two of them 1000: 360 and 1964 samples."""
+    steps = compared_steps(torch.tensor([20.0] * 18 + [2.0] * 982))
+    early = int((steps < 18).sum())
+    assert len(steps) <= 40
+    assert early == pytest.approx(40 * 360 / 2324, abs=1)
+    assert int(steps[-1]) == 999
 
 
 # Line 6

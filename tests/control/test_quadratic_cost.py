@@ -277,9 +277,9 @@ def test_a_fit_per_time_step_is_a_weighted_regression_on_monomials():
         np.testing.assert_allclose(found.model.b[t], scale * w[-1] + mean, atol=1e-6)
 
 
-def test_fits_per_time_step_are_judged_at_some_steps(monkeypatch):
+def test_fits_per_time_step_are_compared_at_some_steps(monkeypatch):
     """What they leave there of the shared fits' error is taken for what they leave of all of it."""
-    monkeypatch.setattr(trajectories, "JUDGED_STEPS", 2)
+    monkeypatch.setattr(trajectories, "MOST_COMPARED", 2)
     width, states = 1.3, batch(varying, episodes=200, noise=0.3)
     y, design = standardised(states)[0], monomials(states)
     fold = np.arange(len(y)) % FOLDS
@@ -289,8 +289,8 @@ def test_fits_per_time_step_are_judged_at_some_steps(monkeypatch):
         made_of = design[learned], y[learned]
         shared = regression(*map(np.concatenate, made_of), 1e-6 * PENALTY, np.zeros(len(PENALTY)))
         wrong = np.square(design[judge] @ shared - y[judge])
-        of_all, of_some = of_all + wrong.sum(), of_some + wrong[:, [1, 4]].sum()
-        for t in (1, 4):
+        of_all, of_some = of_all + wrong.sum(), of_some + wrong[:, [0, T - 1]].sum()
+        for t in (0, T - 1):
             w = regression_per_time_step(*made_of, t, width, shared)
             left += np.square(design[judge, t] @ w - y[judge, t]).sum()
     found = fit(states, width=width, ridge=(1e-6,))

@@ -69,6 +69,16 @@ def test_same_generator_gives_the_same_mixture():
     assert all(torch.equal(a, b) for a, b in zip(first[:3], second[:3], strict=True))
 
 
+def test_a_shift_changes_no_responsibility():
+    """Squares of 1e5 have 11 digits before those that matter."""
+    points = torch.as_tensor(clusters()[0])
+    same = [
+        gmm.responsibilities(gmm.fit_mixture(x, 4, np.random.default_rng(4)).mixture, x)
+        for x in (points, points + 1e5)
+    ]
+    torch.testing.assert_close(same[0], same[1], rtol=0, atol=1e-7)
+
+
 def test_a_change_of_units_changes_no_responsibility():
     points = torch.as_tensor(clusters()[0])
     scale = torch.tensor([2.0**-13, 2.0**17], dtype=torch.float64)  # exact in binary

@@ -137,6 +137,16 @@ def test_kl_divergence_is_the_mean_log_ratio_over_samples():
     assert float(mniw.kl_divergence(q, q)) == pytest.approx(0, abs=1e-12)
 
 
+def test_members_keep_what_is_of_all_of_them():
+    yy, n = torch.eye(2).double(), torch.tensor(3.0).double()
+    yx, xx = torch.randn(2, 5, 2, 3).double(), torch.randn(5, 3, 3).double()
+    some = RegressionStatistics(yy, yx, xx, n).at(torch.tensor([4, 0]))
+    assert torch.equal(some.yy, yy)
+    assert torch.equal(some.n, n)
+    assert torch.equal(some.yx, torch.stack([yx[:, 4], yx[:, 0]], dim=1))
+    assert torch.equal(some.xx, torch.stack([xx[4], xx[0]]))
+
+
 def test_posterior_is_batch_bayesian_regression():
     prior, (x, y) = belief(8), pairs(9, 20)
     X, Y = x.numpy(), y.numpy()

@@ -19,7 +19,7 @@ def sampled(m):
 @pytest.mark.parametrize("m", [1, 2, 5])
 def test_a_quadratic_is_linear_in_monomials(m):
     C, rest, z = sampled(m)
-    w = quadratics.coefficients(torch.as_tensor(C), torch.as_tensor(rest))
+    w = quadratics.weights(torch.as_tensor(C), torch.as_tensor(rest))
     x = quadratics.monomials(torch.as_tensor(z))
     expected = 0.5 * np.einsum("kni,kij,knj->kn", z, C, z)
     expected += np.einsum("kni,ki->kn", z, rest[:, :-1]) + rest[:, -1:]
@@ -38,9 +38,9 @@ def test_sums_of_monomials_hold_those_of_products(m):
 
 
 @pytest.mark.parametrize("m", [1, 2, 5])
-def test_squares_of_weights_are_those_of_coefficients(m):
+def test_squares_of_weights_add_up_to_those_of_coefficients(m):
     C, rest, _ = sampled(m)
-    w = quadratics.coefficients(torch.as_tensor(C), torch.as_tensor(rest)).numpy()
+    w = quadratics.weights(torch.as_tensor(C), torch.as_tensor(rest)).numpy()
     found = (quadratics.squares(w.shape[-1]).numpy() * np.square(w)).sum(axis=-1)
     expected = 0.5 * np.square(C).sum(axis=(1, 2)) + np.square(rest[:, :-1]).sum(axis=-1)
     np.testing.assert_allclose(found, expected, rtol=1e-12)

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -10,12 +11,15 @@ import torch
 from bits import digest, through_a_file
 from model_problems import vector_episodes, vector_task
 
+from solar_cli import stopwatch
 from solar_cli.episodes import Batch, Episodes, window_indices
 from solar_cli.errors import UsageError
 from solar_cli.models import representation, training
+from solar_cli.models.latent_model import LatentModel
 from solar_cli.models.priors import BayesianLDS
 from solar_cli.models.representation import Representation
 from solar_cli.models.smoothing import linear_dynamics
+from solar_cli.models.training import Trainer
 from solar_cli.settings.local import Solar
 from solar_cli.streams import Streams
 
@@ -118,6 +122,31 @@ def test_a_living_representation_is_the_last_that_is_trained():
     metrics = make(score).update(Collected(FIRST))
     assert len(score.states) == 1
     assert metrics["discarded_trainings"] == metrics["seconds_discarded"] == 0.0
+
+
+def test_judging_takes_what_encoding_takes_in_an_update_and_no_training(monkeypatch):
+    clock, calls, fit = Mock(**{"monotonic.return_value": 0.0}), [], Trainer.fit
+    encoded = LatentModel.encoded
+
+    def slowly(model, episodes, device):
+        calls.append(episodes)
+        clock.monotonic.return_value += 1.0
+        return encoded(model, episodes, device)
+
+    def more_slowly(*arguments, **named):
+        clock.monotonic.return_value += 100.0
+        return fit(*arguments, **named)
+
+    monkeypatch.setattr(stopwatch, "time", clock)
+    monkeypatch.setattr(LatentModel, "encoded", slowly)
+    monkeypatch.setattr(Trainer, "fit", more_slowly)
+    model = make(fine_tune_steps=4)
+    batches = [FIRST, vector_episodes(TASK, 6)]
+    for iteration in (1, 2):
+        calls.clear()
+        metrics = model.update(Collected(*batches[:iteration]))
+        assert metrics["seconds_judging"] == len(calls) > 0
+        model.embed(FIRST)  # control does, between updates
 
 
 @pytest.mark.parametrize(("threshold", "least"), [("LEAST_EXPLAINED", 1.0), ("ACTIVE_SHARE", 1.1)])
