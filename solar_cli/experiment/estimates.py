@@ -14,8 +14,12 @@ from typing import TYPE_CHECKING
 
 from solar_cli.experiment.matrix import Action, Plan
 from solar_cli.settings import Cell
+from solar_cli.settings.global_mpc import GlobalMpc
 from solar_cli.settings.local import LatentMethod, LocalControl, StateMethod
+from solar_cli.settings.mpc_nn import MpcNn
 from solar_cli.settings.on_policy import OnPolicy
+from solar_cli.settings.pixel_mpc import PixelMpc
+from solar_cli.settings.schema import Settings
 from solar_cli.store.records import CellRecord, State
 
 if TYPE_CHECKING:
@@ -53,8 +57,8 @@ def memory_needs(cell: Cell) -> list[Need]:
 
     Episodes of the last evaluation and of the first batch; of a local method a minibatch's frames,
     for each time step a matrix over states and moments of what a quadratic of latents is made of,
-    and the weights of all pairs of time steps that posterior inference uses; of a method on policy
-    the windows of a rollout.
+    and the weights of all pairs of time steps that posterior inference uses; of a planner the action
+    sequences that it draws for one episode; of a method on policy the windows of a rollout.
     """
     task, method = cell.configuration.task, cell.configuration.method
     judged = cell.configuration.evaluation.episodes
@@ -84,11 +88,26 @@ def memory_needs(cell: Cell) -> list[Need]:
         if method.local_fit.method == "posterior":
             pairs = task.horizon**2 * FLOAT_BYTES
             needs.append(Need(pairs, "weights of neighbouring time steps", ("task.horizon",)))
+    planner = _planner(method)
+    if planner is not None:
+        name, samples, ahead = planner
+        drawn = samples * ahead * task.action.size * 4  # float32
+        long = (f"{prefix}.{name}.samples", f"{prefix}.{name}.horizon")
+        needs.append(Need(drawn, "action sequences of a plan", long))
     if isinstance(method, OnPolicy):
         every = method.rollout * (episode + task.horizon * seen.window * frame)
         named = (f"{prefix}.rollout", *sizes)
         needs.append(Need(every, "a rollout with all its windows", named))
     return needs
+
+
+def _planner(method: Settings) -> tuple[str, int, int] | None:
+    """Name of a planner's settings, action sequences that it draws, and steps ahead."""
+    if isinstance(method, GlobalMpc | PixelMpc):
+        return "planner", method.planner.samples, method.planner.horizon
+    if isinstance(method, MpcNn):
+        return "shooting", method.shooting.samples, method.shooting.horizon
+    return None
 
 
 def kind_of(cell: Cell) -> Kind:

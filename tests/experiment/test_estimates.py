@@ -121,6 +121,24 @@ def test_moments_of_the_cost_fit_are_those_that_it_holds(
     assert need.settings[0].endswith("latent" if name == "solar" else "components")
 
 
+@pytest.mark.parametrize(
+    ("task", "name", "planner"),
+    [
+        ("nav", "global-mpc", "planner"),
+        ("nav", "pixel-mpc", "planner"),
+        ("car-states", "mpc-nn", "shooting"),
+    ],
+)
+def test_a_planner_holds_the_sequences_that_it_draws(task: str, name: str, planner: str) -> None:
+    prefix = f"methods.{name}.{planner}"
+    sets = [f"{prefix}.samples=300", f"{prefix}.horizon=11"]
+    [cell] = cells(load_card(task), name, [0], sets=sets)
+    [need] = [need for need in memory_needs(cell) if need.what == "action sequences of a plan"]
+    size = cell.configuration.task.action.size
+    assert need.bytes == np.zeros((300, 11, size), np.float32).nbytes
+    assert need.settings == (f"{prefix}.samples", f"{prefix}.horizon")
+
+
 def test_a_large_cell_is_estimated_by_its_size(store: Store) -> None:
     [cell] = cells(load_card("nav"), "solar", [0], sets=["evaluation.episodes=100000"])
     [found] = estimate(store, [Plan(cell, 100, Action.RUN, "why")])
