@@ -57,8 +57,8 @@ def memory_needs(cell: Cell) -> list[Need]:
 
     Episodes of the last evaluation and of the first batch; of a local method a minibatch's frames,
     for each time step a matrix over states and moments of what a quadratic of latents is made of,
-    and the weights of all pairs of time steps that posterior inference uses; of a planner the action
-    sequences that it draws for one episode; of a method on policy the windows of a rollout.
+    and the weights of all pairs of time steps that posterior inference uses; of a planner the
+    action sequences that it draws for one episode; of a method on policy the windows of a rollout.
     """
     task, method = cell.configuration.task, cell.configuration.method
     judged = cell.configuration.evaluation.episodes
