@@ -3,6 +3,7 @@
 import hashlib
 import subprocess
 import sys
+import tempfile
 
 import numpy as np
 import pytest
@@ -151,6 +152,12 @@ def still(off=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.0), lower_turn=(0.0, 0.0, 0.0),
 
 def cost(scene, action=(0.0, 0.0, 0.0, 0.0)):
     return scene.step(np.array(action))[1]
+
+
+def test_no_file_stays_behind(monkeypatch, tmp_path):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    make_world("pybullet").reset(np.array(facts.HOME), np.zeros(3))
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_cost_is_that_of_appendix_d():

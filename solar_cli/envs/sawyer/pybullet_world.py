@@ -5,7 +5,6 @@ from __future__ import annotations
 import tempfile
 import weakref
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -41,14 +40,8 @@ CAPS = [link.joint.torque for link in facts.LINKS if link.joint is not None]
 
 
 @cache
-def _files() -> tuple[tempfile.TemporaryDirectory[str], dict[str, str]]:
-    """The folder with the models, which lasts as long as it is held, and their paths in it."""
-    folder = tempfile.TemporaryDirectory(prefix="solar-sawyer-")
-    models = {"arm": urdf.arm(), "brick": urdf.lower_brick(), "table": urdf.table()}
-    paths = {name: Path(folder.name, f"{name}.urdf") for name in models}
-    for name, model in models.items():
-        paths[name].write_text(model)
-    return folder, {name: str(path) for name, path in paths.items()}
+def _models() -> dict[str, str]:
+    return {"arm": urdf.arm(), "brick": urdf.lower_brick(), "table": urdf.table()}
 
 
 class PybulletWorld:
@@ -86,10 +79,13 @@ class PybulletWorld:
             pybullet.resetJointState(self._arm, joint, angle, **self._client)
 
     def _load(self, model: str, **placed: Any) -> int:
-        """PyBullet's number of a new body that has its file's masses, and no drag."""
-        _, paths = _files()
+        """PyBullet's number of a new body that has its model's masses, and no drag."""
         flags = pybullet.URDF_USE_INERTIA_FROM_FILE
-        body: int = pybullet.loadURDF(paths[model], flags=flags, **placed, **self._client)
+        # The engine reads files only. One that outlived the call would outlive a killed process.
+        with tempfile.NamedTemporaryFile("w", prefix="solar-", suffix=".urdf") as file:
+            file.write(_models()[model])
+            file.flush()
+            body: int = pybullet.loadURDF(file.name, flags=flags, **placed, **self._client)
         for link in range(-1, pybullet.getNumJoints(body, **self._client)):
             pybullet.changeDynamics(
                 body,
