@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from solar_cli.cli.options import AsJson, Database, complete_method
-from solar_cli.cli.printing import print_json, print_table, say
+from solar_cli.cli.printing import complain, print_json, print_table, say
+from solar_cli.errors import SolarError
 
 if TYPE_CHECKING:
     from solar_cli.settings import MethodEntry
@@ -39,7 +40,12 @@ def command(
             _say(entry)
         print_lines(default_lines(entry), json)
         return
-    entries = [method(known) for known in method_names()]
+    entries = []
+    for known in method_names():
+        try:
+            entries.append(method(known))
+        except SolarError as error:  # another package's, and the others are there all the same
+            complain(f"solar: {error}")
     if json:
         print_json([{**asdict(entry), "extras": _on(entry)} for entry in entries])
         return

@@ -75,7 +75,7 @@ def print_estimates(
     at_once = workers or default_workers(len(work))
     known = [estimate.seconds for estimate in work if estimate.seconds is not None]
     time = (
-        f"about {duration(sum(known) / min(at_once, len(work)))}"
+        f"about {duration(max(*known, sum(known) / min(at_once, len(work))))}"
         if work and len(known) == len(work)
         else "a time that is unknown until one such cell has finished"
     )

@@ -21,6 +21,7 @@ from solar_cli.settings.on_policy import OnPolicy
 from solar_cli.settings.pixel_mpc import PixelMpc
 from solar_cli.settings.schema import Settings
 from solar_cli.store.records import CellRecord, State
+from solar_cli.store.results import EPISODES
 
 if TYPE_CHECKING:
     from solar_cli.store.store import Store
@@ -122,10 +123,7 @@ def estimate(store: Store, plans: Sequence[Plan]) -> list[Estimate]:
     """
     finished = _finished(store, [plan.cell for plan in plans])
     speeds = {kind: _speed(records) for kind, records in finished.items()}
-    sizes = {
-        kind: sum(_folder_bytes(store.folder(r.hash)) for r in records) / _episodes(records)
-        for kind, records in finished.items()
-    }
+    sizes = {kind: _size(store, records) for kind, records in finished.items()}
     return [_estimate(plan, speeds, sizes) for plan in plans]
 
 
@@ -134,14 +132,14 @@ def measured_speeds(store: Store, cells: Sequence[Cell]) -> dict[Kind, float]:
     return {kind: _speed(records) for kind, records in _finished(store, cells).items()}
 
 
-def _estimate(plan: Plan, speeds: dict[Kind, float], sizes: dict[Kind, float]) -> Estimate:
+def _estimate(plan: Plan, speeds: dict[Kind, float], sizes: dict[Kind, _Size]) -> Estimate:
     if not plan.is_work:
         return Estimate(0.0, 0, 0)
     kind = kind_of(plan.cell)
     kept = 0 if plan.record is None or plan.action is Action.REDO else plan.record.episodes
     missing = max(0, plan.target - kept)
     seconds = speeds[kind] * missing if kind in speeds else None
-    disk = round(sizes[kind] * plan.target) if kind in sizes else None
+    disk = sizes[kind].at(plan.target) if kind in sizes else None
     memory = sum(need.bytes for need in memory_needs(plan.cell))
     return Estimate(seconds, max(WORKER_BYTES, memory), disk)
 
@@ -158,6 +156,24 @@ def _finished(store: Store, cells: Sequence[Cell]) -> dict[Kind, list[CellRecord
         if record.state is State.FINISHED and record.episodes and kind_of(record.cell) in kinds:
             found[kind_of(record.cell)].append(record)
     return found
+
+
+@dataclass(frozen=True)
+class _Size:
+    """Bytes of a cell's files."""
+
+    an_episode: float
+    rest: float
+
+    def at(self, episodes: int) -> int:
+        return round(self.rest + self.an_episode * episodes)
+
+
+def _size(store: Store, records: Collection[CellRecord]) -> _Size:
+    folders = [store.folder(record.hash) for record in records]
+    kept = sum(_folder_bytes(folder / EPISODES) for folder in folders)
+    rest = sum(map(_folder_bytes, folders)) - kept
+    return _Size(kept / _episodes(records), rest / len(records))
 
 
 def _speed(records: Collection[CellRecord]) -> float:

@@ -80,6 +80,9 @@ def store(address: str | None) -> Iterator[Check]:
             yield Check("database", f"{location}: none yet, the first run makes it")
             yield Check("SQLite", sqlite3.sqlite_version)
         else:
+            if isinstance(location.place, Path) and not os.access(location.place, os.W_OK):
+                advice = "change its rights, or choose another with --db"
+                yield Check("database", f"{location}: read-only", Verdict.BAD, advice)
             with Store.open(address, read_only=True) as opened:
                 yield from (judged(name, said) for name, said in opened.diagnose().items())
     except SolarError as error:

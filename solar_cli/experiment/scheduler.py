@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import signal
+import sys
 import threading
 import time
 from collections import deque
@@ -130,9 +131,11 @@ class Scheduler:
                     if not self._queue and not self._running:
                         self._look_elsewhere()
             finally:
-                for watched in self._running:  # only after an error of our own
+                closed = isinstance(sys.exception(), BrokenPipeError)
+                cause = f"{STOPPED}: nobody reads its output" if closed else "the scheduler failed"
+                for watched in self._running:  # only after an error
                     with suppress(SolarError):
-                        watched.abandon("the scheduler failed")
+                        watched.abandon(cause)
         return self._results
 
     def _stop(self) -> None:

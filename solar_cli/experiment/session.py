@@ -32,6 +32,7 @@ from solar_cli.methods import Diverged, Learner
 from solar_cli.settings import Cell, load, method
 from solar_cli.stopwatch import Stopwatch
 from solar_cli.store.records import CheckpointRecord, Metric
+from solar_cli.store.results import EPISODES
 from solar_cli.store.store import Store
 from solar_cli.streams import Streams
 from solar_cli.wording import counted
@@ -100,7 +101,7 @@ class Session:
             self._simulator,
             task,
             streams.under("environment"),
-            store.folder(cell.hash) / "episodes",
+            store.folder(cell.hash) / EPISODES,
         )
         self.learner: Learner = load(method(cell.method).learner)(
             cell.configuration.method, task, streams.under("learner"), device, self._pulse

@@ -29,6 +29,7 @@ from solar_cli.reporting.statistics import (
 )
 from solar_cli.reporting.summary import caveats, title
 from solar_cli.reporting.tables import Table, bounded, interval, markdown, number, one_line
+from solar_cli.settings.registry import is_level
 from solar_cli.store.store import Store
 from solar_cli.wording import counted
 
@@ -128,7 +129,7 @@ def compare(
     Where ``tasks`` are named, on theirs alone.
 
     Without ``right`` it is ``solar``; without both, every method and variant is compared with
-    ``solar`` on every problem. Raises `UsageError` for a name the store has no curve of, and
+    `baseline_of` every problem. Raises `UsageError` for a name the store has no curve of, and
     `SolarError` where there is nothing to compare.
     """
     present = code()
@@ -167,19 +168,22 @@ def compare(
 
 
 def baseline_of(problem: Problem) -> Curve | None:
-    """What others are compared with: ``solar``, else the first of its variants."""
-    own = [curve for curve in problem.curves if curve.method == BASELINE and "@" not in curve.label]
-    return problem.curve(BASELINE) or (own[0] if own else None)
+    """What others are compared with: ``solar``, else one of its variants, else of what learns."""
+    plain = [curve for curve in problem.curves if "@" not in curve.label]
+    own = [curve for curve in plain if curve.method == BASELINE]
+    learned = [curve for curve in plain if not is_level(curve.method)]
+    return problem.curve(BASELINE) or next(iter([*own, *learned]), None)
 
 
 def stands_in(baseline: Curve) -> list[str]:
-    """What to know where others are compared with a variant, for want of the default: or nothing.
+    """What to know where others are compared with something else than ``solar``: or nothing.
 
-    Of `baseline_of`; a variant that was asked for stands in for nothing.
+    Of `baseline_of`; what was asked for stands in for nothing.
     """
     if baseline.label == BASELINE:
         return []
-    return [f"there is no {BASELINE} of the default variant: {baseline.label} stands in for it"]
+    missing = f"{BASELINE} of the default variant" if baseline.method == BASELINE else BASELINE
+    return [f"there is no {missing}: {baseline.label} stands in for it"]
 
 
 def _known(found: list[Problem], name: str) -> str:

@@ -19,7 +19,7 @@ class Budget(Settings):
     """Where to stop, in episodes; never part of a cell's identity."""
 
     desk: int = setting(..., "episodes for an evening", presentation=True, ge=1, le=MOST_EPISODES)
-    full: int = setting(..., "episodes of the paper", presentation=True, ge=1, le=MOST_EPISODES)
+    full: int = setting(..., "the paper's, or for long", presentation=True, ge=1, le=MOST_EPISODES)
 
 
 class Batches(Settings):
@@ -28,7 +28,10 @@ class Batches(Settings):
     initial: int = setting(..., "white-noise episodes before the first model", "App. D", ge=2)
     noisy: int = setting(..., "episodes of the policy with its noise, an iteration", "App. D", ge=2)
     noise_free: int = setting(
-        0, "further episodes an iteration without noise, which judge the policy", ge=0
+        0,
+        "further episodes an iteration without noise, which judge the policy; of a planner, which "
+        "has nothing to judge, with its noise",
+        ge=0,
     )
 
 

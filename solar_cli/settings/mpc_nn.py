@@ -20,7 +20,7 @@ class Shooting(Settings):
 class MpcNn(Settings):
     """Neural dynamics of states, random shooting, the task's own cost."""
 
-    initial: int = setting(10, "episodes of exploration noise", "their release: 10 to 25", ge=2)
+    initial: int = setting(10, "episodes of uniform actions", "their release: 10 to 25", ge=2)
     episodes: int = setting(10, "episodes an iteration", "their release", ge=2)
     budget: Budget = setting(Budget(desk=40, full=80), "where to stop", presentation=True)
     network: NeuralFit = setting(

@@ -51,6 +51,8 @@ def locate(address: str | None) -> Location:
     a folder of its own, as two databases may hold the same cell; ``SOLAR_HOME`` names the folder
     for a server's database. Raises `UsageError` for an address that is none.
     """
+    if address is not None and not address.strip():
+        raise UsageError(f"the database's address is empty: {EXPECTED}, or leave it out")
     text = address or os.environ.get("SOLAR_DB") or DEFAULT
     if "://" not in text:
         return _file(text)

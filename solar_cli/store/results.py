@@ -15,8 +15,8 @@ from solar_cli.store.opened import Opened
 from solar_cli.store.records import ArtifactRecord, CheckpointRecord, Metric
 from solar_cli.store.schema import ArtifactRow, CellRow, CheckpointRow, MetricRow
 
-CHECKPOINTS = "checkpoints"
-"""folder of a cell's checkpoint files, below its own"""
+CHECKPOINTS, EPISODES = "checkpoints", "episodes"
+"""folders of a cell's files, below its own"""
 
 
 class Results(Opened):

@@ -3,13 +3,14 @@
 import csv
 import io
 import json
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
 from scenario import Done, Solar, Stored
 from stored_cells import store_attempt
 
-from solar_cli.settings import cells, load_card
+from solar_cli.settings import cells, load_card, registry
 from solar_cli.store.owner import Owner
 from solar_cli.store.records import Metric, Outcome
 from solar_cli.store.store import Store
@@ -235,6 +236,19 @@ def test_methods_lists_the_methods_and_the_settings_of_one(solar: Solar) -> None
     assert lines["methods.solar.batches.initial"]["origin"] == "set by the card"
     assert lines["methods.solar.update.kl_step"]["origin"] == "default"
     assert "KL-constrained" in solar("methods").out
+
+
+def test_a_method_that_cannot_be_loaded_hides_no_other(
+    solar: Solar, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lost = EntryPoint("lost", "no_such_module:ENTRY", registry.GROUP)
+    known = {**registry._known(), "lost": lost}
+    monkeypatch.setattr(registry, "_known", lambda: known)
+    done = solar("methods", "--json")
+    assert done.code == 0
+    assert set(known) - {entry["name"] for entry in json.loads(done.out)} == {"lost"}
+    assert "method 'lost' of entry point 'no_such_module:ENTRY' cannot be loaded" in done.err
+    assert not registry.is_level("lost")
 
 
 def test_methods_says_where_one_departs_from_its_source_and_what_it_has_beyond(

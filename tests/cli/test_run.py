@@ -39,6 +39,9 @@ def test_a_dry_run_says_what_and_why_and_starts_nothing(solar: Solar, stored: St
     text = solar(*SMOKE, "--seeds", "6", "--dry-run", "--workers", "1", "--db", stored.db).out
     assert "3 of 6 cells to compute, 1 at a time: about 12 s; nothing was started" in text
     assert stored.db.read_bytes() == before
+    # Together 12.5 s, but no cell takes less than 5.
+    text = solar(*SMOKE, "--seeds", "6", "--dry-run", "--workers", "9", "--db", stored.db).out
+    assert "9 at a time: about 5 s" in text
 
 
 def test_a_dry_run_without_a_database_makes_none(solar: Solar, tmp_path: Any) -> None:

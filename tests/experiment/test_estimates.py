@@ -41,7 +41,9 @@ def computed(
     )
     store.end(cell.hash, number, outcome)
     store.folder(cell.hash).mkdir(parents=True)
-    (store.folder(cell.hash) / "file").write_bytes(bytes(episodes * 10))
+    (store.folder(cell.hash) / "checkpoint").write_bytes(bytes(300))
+    (store.folder(cell.hash) / "episodes").mkdir()
+    (store.folder(cell.hash) / "episodes" / "file").write_bytes(bytes(episodes * 10))
 
 
 def test_time_and_disk_follow_the_pace_of_finished_seeds(
@@ -49,7 +51,7 @@ def test_time_and_disk_follow_the_pace_of_finished_seeds(
 ) -> None:
     one, two, broken, new, half = make_cells(5)
     computed(store, one, 10, 20.0)
-    computed(store, two, 30, 100.0)  # together 3 seconds an episode, 10 bytes an episode
+    computed(store, two, 30, 100.0)  # together 3 seconds and 10 bytes an episode, and 300 bytes
     computed(store, broken, 10, 9999.0, Outcome.FAILED)
     computed(store, half, 25, 9999.0, Outcome.INTERRUPTED)
     plans = [
@@ -59,9 +61,9 @@ def test_time_and_disk_follow_the_pace_of_finished_seeds(
         Plan(one, 10, Action.SKIP, "why", store.find(one.hash)),
     ]
     assert estimate(store, plans) == [
-        Estimate(300.0, WORKER_BYTES, 1000),
-        Estimate(225.0, WORKER_BYTES, 1000),
-        Estimate(300.0, WORKER_BYTES, 1000),
+        Estimate(300.0, WORKER_BYTES, 1300),
+        Estimate(225.0, WORKER_BYTES, 1300),
+        Estimate(300.0, WORKER_BYTES, 1300),
         Estimate(0.0, 0, 0),
     ]
 

@@ -1,5 +1,6 @@
 """What would spoil a run is seen before it starts, with what to do about it."""
 
+import os
 import shutil
 from collections import namedtuple
 from pathlib import Path
@@ -8,6 +9,7 @@ import pytest
 
 from solar_cli.experiment import machine
 from solar_cli.experiment.machine import Check, Verdict, checks, folder, judged
+from solar_cli.store.store import Store
 
 Usage = namedtuple("Usage", "total used free")
 
@@ -29,6 +31,17 @@ def test_a_database_that_is_not_there_yet_is_no_fault(tmp_path: Path) -> None:
 def test_what_is_no_database_is_bad(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("my notes\n" * 100)
     assert verdicts(list(machine.store(str(tmp_path / "notes.txt"))))["database"] is Verdict.BAD
+
+
+def test_a_database_that_cannot_be_written_is_bad(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To root every file is writable."""
+    Store.open(str(tmp_path / "solar.db")).close()
+    monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK)
+    first = next(machine.store(str(tmp_path / "solar.db")))
+    assert (first.name, first.verdict) == ("database", Verdict.BAD)
+    assert "read-only" in first.found
 
 
 @pytest.mark.parametrize(

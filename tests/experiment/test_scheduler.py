@@ -109,6 +109,21 @@ def test_a_stop_lets_workers_save_and_starts_no_other(
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL  # as it was before
 
 
+def test_a_run_that_nobody_reads_stops_and_says_so(
+    store: Store, stub: Callable[..., list[Result]]
+) -> None:
+    def closed(event: Event) -> None:
+        if event.message:
+            raise BrokenPipeError
+
+    with pytest.raises(BrokenPipeError):
+        stub("finish:200", report=closed)
+    [record] = store.cells()
+    assert record.last_attempt is not None
+    assert record.last_attempt.outcome is Outcome.INTERRUPTED
+    assert record.last_attempt.error == "the run was stopped: nobody reads its output"
+
+
 def test_the_signals_of_one_request_count_once(
     store: Store, stub: Callable[..., list[Result]]
 ) -> None:

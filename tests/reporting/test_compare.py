@@ -89,6 +89,18 @@ def test_bare_every_method_and_variant_is_compared_with_solar(tmp_path):
     assert "solar:smoke stands in for it" in found.to_markdown()
 
 
+def test_without_solar_another_method_that_learns_stands_in(tmp_path):
+    with database(tmp_path) as store:
+        for method in ("random", "rce", "vae"):
+            compute(store, cell(method), [1.0, 0.2])
+        found = compare(store)
+    assert [(p.left.label, p.right.label) for p in found.pairs] == [
+        ("random", "rce"),
+        ("vae", "rce"),
+    ]
+    assert all("there is no solar: rce stands in for it" in p.notes for p in found.pairs)
+
+
 def test_exports_say_the_same_and_json_is_strict(tmp_path):
     with database(tmp_path) as store:
         for seed in range(4):

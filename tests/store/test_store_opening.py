@@ -173,6 +173,12 @@ def test_addresses_of_one_file_are_one_store(
         assert odd.is_file()
 
 
+@pytest.mark.parametrize("address", ["", "  "])
+def test_an_empty_address_is_no_default(address: str) -> None:
+    with pytest.raises(UsageError, match="the database's address is empty"):
+        locate(address)
+
+
 def test_two_databases_never_share_the_files_of_a_cell(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
