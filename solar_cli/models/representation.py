@@ -134,7 +134,7 @@ class Representation:
         else:
             metrics = self._judge(newest)
             self._conclude(recent)
-        seconds = {"seconds_judging": self._watch.seconds()["judging"]}
+        seconds = {"seconds_judging": self._watch.seconds().get("judging", 0.0)}
         return {**metrics, **self._model.prior.metrics(), **seconds}
 
     def _train_first(self, iteration: int, batches: list[Episodes]) -> dict[str, float]:
