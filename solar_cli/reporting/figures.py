@@ -171,8 +171,11 @@ def _scale(axes: Axes, problem: Problem) -> None:
     if min(ends) > 0 and max(ends) > LOG_EPISODES * min(ends):
         counts = np.concatenate([seed.episodes for curve in problem.curves for seed in curve.seeds])
         # Before the first of them nothing is known: iteration 0 has its place, and no more.
-        axes.set_xscale("symlog", linthresh=int(counts[counts > 0].min()), linscale=0.4)
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
+        first = int(counts[counts > 0].min())
+        axes.set_xscale("symlog", linthresh=first, linscale=0.4)
+        axes.xaxis.set_major_formatter(
+            FuncFormatter(lambda value, _: "" if 0 < value < first else f"{value:,.0f}")
+        )
         axes.set_xlim(left=0)
     else:
         axes.set_xlim(0, 1.02 * max(ends) or 1)

@@ -83,6 +83,8 @@ def test_a_logarithmic_axis_of_episodes_shows_where_a_curve_starts_and_ends():
     low, high = axes.get_xlim()
     assert low == 0
     assert high >= 20_000
+    named = axes.xaxis.get_major_formatter()
+    assert [named(count) for count in (0, 10, 100, 10_000)] == ["0", "", "100", "10,000"]
     place = axes.transAxes.inverted().transform
     shown = [place(axes.transData.transform((count, 0.5)))[0] for count in (0, 50, 240, 20_000)]
     assert shown[0] == 0
