@@ -19,6 +19,7 @@ import gymnasium
 import pytest
 import torch
 from stable_baselines3 import PPO
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -98,6 +99,8 @@ def peer(configuration, env):
         ),
         device="cpu",
     )
+    # Its own logger leaves a folder in the temporary directory.
+    model.set_logger(Logger(folder=None, output_formats=[]))
     steps = ROLLOUTS * settings.rollout * configuration.task.horizon
     return lambda: model.learn(steps)
 

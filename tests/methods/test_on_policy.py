@@ -12,6 +12,7 @@ from sb3_contrib import TRPO
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.distributions import DiagGaussianDistribution
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
@@ -110,6 +111,8 @@ def plain(name, settings, shared, rollouts, card, monkeypatch):
         **own[name],
     )
     started = [parameter.detach().clone() for parameter in model.policy.parameters()]
+    # Its own logger leaves a folder in the temporary directory.
+    model.set_logger(Logger(folder=None, output_formats=[]))
     draws = OurDraws(env, rollouts, monkeypatch)
     model.learn(settings.horizon * HORIZON, callback=draws)
     assert draws.done == rollouts
