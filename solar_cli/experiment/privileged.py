@@ -190,7 +190,7 @@ class Privileged(LocalLearner):
         any."""
         if Part.COST not in self.given or self._rollouts is None:
             return super().fitted_cost(states, older)
-        settings = CostFit(width=OWN_STEP, reach=0, terminal=self.settings.cost_fit.terminal)
+        settings = CostFit(width=OWN_STEP, terminal=self.settings.cost_fit.terminal)
         return fit_quadratic_cost(self._rollouts, [], self.task.action_cost, settings, self.latent)
 
     def _rolled_out(self, iteration: int) -> Trajectories:

@@ -201,13 +201,6 @@ class CostFit(Settings):
     per_time: Literal["chosen", "never"] = setting(
         "chosen", "a fit per time step where held-out R2 says so, or never"
     )
-    reach: float = setting(
-        3.0,
-        "std of a sample's weight in fits per time step around the newest episodes, in theirs, "
-        "which are tried where no other fit tells what episodes differ by; 0 for none",
-        ge=0,
-        added=0.0,
-    )
     terminal: float = setting(3.0, "weight of the cost of the last state", gt=0)
 
 

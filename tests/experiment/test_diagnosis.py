@@ -178,7 +178,7 @@ def test_the_cost_is_fitted_on_the_observers_rollouts(
     run = Watched(tmp_path, monkeypatch, small(), Part.COST).iterate(2)
     _, dynamics, cost, *_ = run.updates[-1]
     rollouts = run.learner.embedded(Lesson(run.observed, [], [])).own
-    settings = CostFit(width=privileged.OWN_STEP, reach=0, terminal=3.0)
+    settings = CostFit(width=privileged.OWN_STEP, terminal=3.0)
     again = quadratic_cost.fit_quadratic_cost(rollouts, [], 0.001, settings, 4).model
     assert torch.equal(cost.C, again.C)
     first, second = (collected_in(iteration, run.environment) for iteration in (1, 2))
