@@ -44,6 +44,15 @@ class Moments(NamedTuple):
         return Moments(x.mT @ x, xy, y.square().sum(dim=1), live.sum(dim=0).to(y))
 
     @staticmethod
+    def weighted(
+        x: Float[Tensor, "*k n q"], y: Float[Tensor, " n"], weight: Float[Tensor, "*k n"]
+    ) -> Moments:
+        """Of the same samples, which count for more or less than one."""
+        heavy = x * weight.unsqueeze(-1)
+        xy = (heavy.mT @ y.unsqueeze(-1)).squeeze(-1)
+        return Moments(heavy.mT @ x, xy, (weight * y.square()).sum(dim=-1), weight.sum(dim=-1))
+
+    @staticmethod
     def stacked(parts: Sequence[Moments]) -> Moments:
         """Of several fits, the new first axis."""
         return Moments(*map(torch.stack, zip(*parts, strict=True)))
@@ -51,6 +60,11 @@ class Moments(NamedTuple):
     def error(self, w: Float[Tensor, "*k q"]) -> Float[Tensor, "*k"]:
         """Sum of squared errors of weights of monomials."""
         return _inner(w, _product(self.xx, w) - 2 * self.xy) + self.yy
+
+    def spread_of_errors(self, w: Float[Tensor, "*k q"]) -> Float[Tensor, "*k"]:
+        """Sum of squares of what errors differ by from their mean."""
+        total = self.xy[..., -1] - _inner(self.xx[..., -1, :], w)
+        return self.error(w) - total.square() / self.n.clamp_min(1.0)
 
     def each(self, change: Callable[[Tensor], Tensor]) -> Moments:
         """The same done to all of them."""

@@ -5,6 +5,10 @@ are of whitened latents and standardised costs, where one ridge serves every tas
 latents has 153 coefficients, more than a few episodes tell: how much older batches count, how large
 coefficients may be, and whether each time step has its own, is chosen by held-out R2.
 
+Of a cost that falls from 11 cm to 1, R2 is near 1 as soon as a fit knows that it falls. Control
+needs what episodes differ by at the same time step. Where the best fit hardly tells that, the cost
+is not quadratic over the whole of the episodes, and fits around them are tried (`local_cost`).
+
 Axes: N episodes, T horizon, m features of z, q monomials of them. The leading axes k are of fits
 that are made at once.
 """
@@ -23,6 +27,7 @@ from torch import Tensor
 
 from solar_cli.control.convex_quadratic import Moments, descended, least_squares
 from solar_cli.control.linear_gaussian import QuadraticCost
+from solar_cli.control.local_cost import Samples, Surroundings, fitted_around
 from solar_cli.control.trajectories import Trajectories, compared_steps
 from solar_cli.inference import quadratics
 from solar_cli.settings.local import CostFit
@@ -35,6 +40,11 @@ PULL = 0.03
 """of a fit per time step towards the shared one, on standardised costs; .1 is better where costs
 hardly vary (Sawyer: held-out R2 .70 for .69, at .001 .49), less where they do"""
 FOLDS = 4
+ENOUGH = 0.9
+"""share of what costs differ by at a time step. Of fits for all time steps it is .94 and more on
+nav, car and pusher, and -.1 to .7 on Sawyer, whose cost is a sum of distances: with the
+true state for latents, 97 % of bricks are stacked after 215 episodes by fits around them, and 56 %
+without (six seeds)"""
 
 
 class Choice(NamedTuple):
@@ -46,6 +56,24 @@ class Choice(NamedTuple):
     """weight of squared coefficients"""
     per_time: bool
     """whether a fit per time step won"""
+    around: bool = False
+    """whether fits around the episodes won"""
+
+
+class Score(NamedTuple):
+    """How much of held-out costs is explained."""
+
+    r2: float
+    """of their variance; where fits per time step won, an estimate from some time steps"""
+    within: float
+    """of what they differ by at the same time step, which is what control needs"""
+
+
+class Around(NamedTuple):
+    """What fits around the episodes are made from."""
+
+    surroundings: Surroundings
+    samples: Samples
 
 
 class FittedCost(NamedTuple):
@@ -53,15 +81,15 @@ class FittedCost(NamedTuple):
 
     model: QuadraticCost
     r2: float
-    """share of the variance of held-out costs that is explained; where fits per time step won, an
-    estimate from some time steps"""
+    within: float
+    """as `Score` says"""
     choice: Choice
 
     @property
     def metrics(self) -> dict[str, float]:
         """To be stored."""
         chosen = {f"cost_{name}": float(value) for name, value in self.choice._asdict().items()}
-        return {"cost_r2": self.r2, **chosen}
+        return {"cost_r2": self.r2, "cost_r2_within": self.within, **chosen}
 
 
 def fit_quadratic_cost(
@@ -71,8 +99,8 @@ def fit_quadratic_cost(
     settings: CostFit,
     features: int,
 ) -> FittedCost:
-    """Fit on the first ``features`` entries of z: one fit for all time steps, and one per time
-    step where held-out R2 says that it is better.
+    """Fit on the first ``features`` entries of z: one fit for all time steps, or one per time step,
+    of neighbouring ones or around the episodes, where held-out costs say that it is better.
 
     ``older`` batches may support the shared fit. The cost of the last state, which is never
     observed, is the last fit's times ``settings.terminal``.
@@ -81,23 +109,26 @@ def fit_quadratic_cost(
     mean, scale = costs[states.live].mean(), costs[states.live].std().clamp_min(1e-9)
     fold = torch.arange(len(costs)) % min(FOLDS, len(costs))
 
-    def standardised(batch: Trajectories) -> Moments:
-        """Of every time step."""
+    def seen(batch: Trajectories) -> tuple[Tensor, Tensor, Tensor]:
+        """States, standardised costs, and where both count."""
         y = (_of_states(batch, action_cost) - mean) / scale
-        return Moments.of(batch.z[:, :-1, :features], y, batch.live)
+        return batch.z[:, :-1, :features], y, batch.live
 
-    folds = [standardised(states.only(fold == k)) for k in range(int(fold.max()) + 1)]
+    folds = [Moments.of(*seen(states.only(fold == k))) for k in range(int(fold.max()) + 1)]
     whole = reduce(Moments.plus, folds)
-    past = [standardised(batch).together() for batch in older]
+    past = [Moments.of(*seen(batch)).together() for batch in older]
     support = reduce(Moments.plus, past) if past else None
-    scores = _held_out(folds, whole, support, settings)
-    best = max(scores, key=lambda choice: scores[choice])
+    z, y, live = seen(states)
+    around = Around(Surroundings.of(z, live), Samples.of(z, y, live, fold))
+    best, score = _chosen(folds, whole, support, around, settings)
     w = _fit_shared(whole.together(), support, [best], settings)[0]
-    if best.per_time:
+    if best.around:
+        w = fitted_around(*around, [w], [None])[0]
+    elif best.per_time:
         every = torch.arange(len(whole.n))
         w = _fit_each(_near(whole, every, settings.width), w)
     model = _assembled(w, states, features, action_cost, mean, scale, settings.terminal)
-    return FittedCost(model, scores[best], best)
+    return FittedCost(model, *score, best)
 
 
 def _of_states(batch: Trajectories, action_cost: float) -> Float[Tensor, "N T"]:
@@ -105,10 +136,14 @@ def _of_states(batch: Trajectories, action_cost: float) -> Float[Tensor, "N T"]:
     return batch.costs - action_cost * batch.actions.square().sum(dim=-1)
 
 
-def _held_out(
-    folds: list[Moments], whole: Moments, support: Moments | None, settings: CostFit
-) -> dict[Choice, float]:
-    """R2 of every choice on the episodes that a fit was not given; ``whole`` is of all folds.
+def _chosen(
+    folds: list[Moments],
+    whole: Moments,
+    support: Moments | None,
+    around: Around,
+    settings: CostFit,
+) -> tuple[Choice, Score]:
+    """The best choice, on the episodes that its fits were not given; ``whole`` is of all folds.
 
     Fits per time step are compared with the best shared one at `compared_steps`. Their error in
     all is taken to be its error in all, times the ratio of both at these steps.
@@ -123,20 +158,44 @@ def _held_out(
     choices = [Choice(w, ridge, per_time=False) for w, ridge in product(weights, settings.ridge)]
     spread = float(judges.yy.sum())
     if spread <= 1e-12 * float(judges.n.sum()):  # nothing to explain
-        return dict.fromkeys(choices, 1.0)
+        return choices[0], Score(1.0, 1.0)
     fits = _fit_shared(given(judges, judges.together()), support, choices, settings)
     r2 = 1 - judges.error(fits).sum(dim=1) / spread
-    scores = dict(zip(choices, r2.tolist(), strict=True))
+    shared, best, times = fits[int(r2.argmax())], choices[int(r2.argmax())], compared_steps(whole.n)
+    scale, errors = (_errors(folds, times, w) for w in (torch.zeros_like(shared), shared))
+
+    def score(fits_of_folds: Sequence[Tensor]) -> Score:
+        """Of fits per time step, one for each fold that they were made without."""
+        wrong = _errors(folds, times, fits_of_folds)
+        left = float(wrong[0] / errors[0].clamp_min(1e-12))
+        within = 1 - float(wrong[1] / scale[1].clamp_min(1e-12))
+        return Score(1 - left * (1 - float(r2.max())), within)
+
+    found = {best: score(list(shared))._replace(r2=float(r2.max()))}
     if settings.per_time == "never":
-        return scores
-    best, times, errors = int(r2.argmax()), compared_steps(whole.n), r2.new_zeros(2)
+        return best, found[best]
     near = [_near(fold, times, settings.width) for fold in folds]
     every = reduce(Moments.plus, near)
-    for fold, own, shared in zip(folds, near, fits[best], strict=True):
-        each, judge = _fit_each(given(own, every), shared), fold.each(itemgetter(times))
-        errors += torch.stack([judge.error(w).sum() for w in (each, shared)])
-    left = float(errors[0] / errors[1].clamp_min(1e-12))
-    return {**scores, choices[best]._replace(per_time=True): 1 - left * (1 - float(r2[best]))}
+    each = [_fit_each(given(own, every), w) for own, w in zip(near, shared, strict=True)]
+    found[best._replace(per_time=True)] = score(each)
+    winner = max(found, key=lambda choice: found[choice].r2)
+    if found[winner].within < ENOUGH and len(folds) > 1:
+        where, samples = around.surroundings.at(times), around.samples
+        local = fitted_around(where, samples, list(shared), range(len(folds)))
+        found[best._replace(around=True)] = score(list(local))
+        winner = max((winner, best._replace(around=True)), key=lambda choice: found[choice].within)
+    return winner, found[winner]
+
+
+def _errors(
+    folds: list[Moments], times: Int[Tensor, " times"], fits: Sequence[Tensor] | Tensor
+) -> Float[Tensor, "2"]:
+    """Sums of squares of the errors of each fold's fit, and of what they differ by at a time."""
+    total = folds[0].n.new_zeros(2)
+    for fold, w in zip(folds, fits, strict=True):
+        judge = fold.each(itemgetter(times))
+        total += torch.stack([judge.error(w).sum(), judge.spread_of_errors(w).sum()])
+    return total
 
 
 def _fit_shared(

@@ -45,6 +45,18 @@ def weights(C: Float[Tensor, "*k m m"], rest: Float[Tensor, "*k m1"]) -> Float[T
     return torch.cat([halves * C[..., i, j], rest], dim=-1)
 
 
+def substituted(
+    w: Float[Tensor, "*k q"], A: Float[Tensor, "*k m m"], s: Float[Tensor, "*k m"]
+) -> Float[Tensor, "*k q"]:
+    """Weights in u of a quadratic in z = A u + s."""
+    m = s.shape[-1]
+    C, c, b = curvature(w), w[..., -m - 1 : -1], w[..., -1:]
+    curved = (C @ s[..., None])[..., 0]
+    slope = (A.mT @ (curved + c)[..., None])[..., 0]
+    height = b + ((c + 0.5 * curved) * s).sum(dim=-1, keepdim=True)
+    return weights(A.mT @ C @ A, torch.cat([slope, height], dim=-1))
+
+
 def squares(q: int) -> Float[Tensor, " q"]:
     """What each w_q^2 is multiplied by in |C|^2 / 2 + |c|^2, a sum of squared coefficients."""
     m = features(q)

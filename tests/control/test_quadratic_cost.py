@@ -183,7 +183,24 @@ def test_r2_is_that_of_episodes_left_out():
         squared += np.square(rows(design[judge]) @ w - known[judge].ravel()).sum()
     expected = 1 - squared / np.square(known - known.mean()).sum()
     assert 0.1 < expected < 0.8
-    assert fit(states, per_time="never", ridge=(0.0,)).r2 == pytest.approx(expected, abs=1e-6)
+    found = fit(states, per_time="never", ridge=(0.0,))
+    assert found.r2 == pytest.approx(expected, abs=1e-6)
+
+
+def test_r2_within_is_of_what_costs_differ_by_at_a_time_step():
+    """A cost that only time tells is explained, and what noise adds to it is not."""
+    states = batch(lambda z, t: quadratic(z), noise=2.0)
+    known = states.costs.numpy() - ALPHA * np.square(states.actions.numpy()).sum(axis=-1)
+    design, fold = monomials(states), np.arange(N) % FOLDS
+    left = total = 0.0
+    for k in range(FOLDS):
+        learned, judge = fold != k, fold == k
+        w = np.linalg.lstsq(rows(design[learned]), known[learned].ravel(), rcond=None)[0]
+        wrong = design[judge] @ w - known[judge]
+        left += np.square(wrong - wrong.mean(axis=0)).sum()
+        total += np.square(known[judge] - known[judge].mean(axis=0)).sum()
+    found = fit(states, per_time="never", ridge=(0.0,))
+    assert found.within == pytest.approx(1 - left / total, abs=1e-6)
 
 
 def varying(z, t):

@@ -111,11 +111,12 @@ def test_moments_of_the_cost_fit_are_those_that_it_holds(
     actions = torch.zeros(8, T, 2).double()
     held: list[int] = []
 
-    def looked_at(folds: list[Any], whole: Any, *_: Any) -> dict[quadratic_cost.Choice, float]:
+    def looked_at(folds: list[Any], whole: Any, *_: Any) -> tuple[Any, Any]:
         held.extend(part.xx.nbytes for part in (*folds, whole))
-        return {quadratic_cost.Choice(0.0, 0.0, per_time=False): 1.0}
+        choice = quadratic_cost.Choice(0.0, 0.0, per_time=False)
+        return choice, quadratic_cost.Score(1.0, 1.0)
 
-    monkeypatch.setattr(quadratic_cost, "_held_out", looked_at)
+    monkeypatch.setattr(quadratic_cost, "_chosen", looked_at)
     states = Trajectories(z, actions, actions, costs, costs > -1)
     quadratic_cost.fit_quadratic_cost(states, [], 0.0, CostFit(), latents)
     [need] = [need for need in memory_needs(cell) if need.what == "moments of the cost fit"]

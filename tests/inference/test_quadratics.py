@@ -44,3 +44,18 @@ def test_squares_of_weights_add_up_to_those_of_coefficients(m):
     found = (quadratics.squares(w.shape[-1]).numpy() * np.square(w)).sum(axis=-1)
     expected = 0.5 * np.square(C).sum(axis=(1, 2)) + np.square(rest[:, :-1]).sum(axis=-1)
     np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("m", [1, 2, 5])
+def test_a_quadratic_of_other_coordinates_has_the_same_values(m):
+    C, rest, u = sampled(m)
+    rng = np.random.default_rng(9)
+    A, s = rng.normal(size=(K, m, m)), rng.normal(size=(K, m))
+    w = quadratics.weights(torch.as_tensor(C), torch.as_tensor(rest))
+    z = u @ A.swapaxes(-1, -2) + s[:, None]
+    there = quadratics.substituted(w, torch.as_tensor(A), torch.as_tensor(s))
+    values = (
+        np.einsum("knq,kq->kn", quadratics.monomials(torch.as_tensor(x)), weights)
+        for x, weights in ((z, w), (u, there))
+    )
+    np.testing.assert_allclose(*values, rtol=1e-9)
