@@ -61,10 +61,9 @@ class Moments(NamedTuple):
         """Sum of squared errors of weights of monomials."""
         return _inner(w, _product(self.xx, w) - 2 * self.xy) + self.yy
 
-    def spread_of_errors(self, w: Float[Tensor, "*k q"]) -> Float[Tensor, "*k"]:
-        """Sum of squares of what errors differ by from their mean."""
-        total = self.xy[..., -1] - _inner(self.xx[..., -1, :], w)
-        return self.error(w) - total.square() / self.n.clamp_min(1.0)
+    def surplus(self, w: Float[Tensor, "*k q"]) -> Float[Tensor, "*k"]:
+        """Sum of the errors themselves."""
+        return self.xy[..., -1] - _inner(self.xx[..., -1, :], w)
 
     def each(self, change: Callable[[Tensor], Tensor]) -> Moments:
         """The same done to all of them."""

@@ -3,7 +3,7 @@
 The action's part is known; C = L L^T, c and b minimise the squared error of observed costs. Fits
 are of whitened latents and standardised costs, where one ridge serves every task. A quadratic of 16
 latents has 153 coefficients, more than a few episodes tell: how much older batches count, how large
-coefficients may be, and whether each time step has its own, is chosen by held-out R2.
+coefficients may be, and whether each time step has its own, is chosen by held-out costs.
 
 Of a cost that falls from 11 cm to 1, R2 is near 1 as soon as a fit knows that it falls. Control
 needs what episodes differ by at the same time step. Where the best fit hardly tells that, the cost
@@ -15,8 +15,8 @@ that are made at once.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import reduce
+from collections.abc import Callable, Sequence
+from functools import cache, reduce
 from itertools import product
 from operator import itemgetter
 from typing import NamedTuple
@@ -27,7 +27,7 @@ from torch import Tensor
 
 from solar_cli.control.convex_quadratic import Moments, descended, least_squares
 from solar_cli.control.linear_gaussian import QuadraticCost
-from solar_cli.control.local_cost import Samples, Surroundings, fitted_around
+from solar_cli.control.local_cost import LEAST_EPISODES, Samples, Surroundings, fitted_around
 from solar_cli.control.trajectories import Trajectories, compared_steps
 from solar_cli.inference import quadratics
 from solar_cli.settings.local import CostFit
@@ -40,6 +40,7 @@ PULL = 0.03
 """of a fit per time step towards the shared one, on standardised costs; .1 is better where costs
 hardly vary (Sawyer: held-out R2 .70 for .69, at .001 .49), less where they do"""
 FOLDS = 4
+ALIKE = 1e-12  # variance of standardised costs below which there is nothing to explain
 ENOUGH = 0.9
 """share of what costs differ by at a time step. Of fits for all time steps it is .94 and more on
 nav, car and pusher, and -.1 to .7 on Sawyer, whose cost is a sum of distances: with the
@@ -48,7 +49,7 @@ without (six seeds)"""
 
 
 class Choice(NamedTuple):
-    """What held-out R2 decides."""
+    """What held-out costs decide."""
 
     older: float
     """weight of older samples"""
@@ -67,6 +68,14 @@ class Score(NamedTuple):
     """of their variance; where fits per time step won, an estimate from some time steps"""
     within: float
     """of what they differ by at the same time step, which is what control needs"""
+
+
+class Squares(NamedTuple):
+    """Sums of squares of held-out costs, or of what a fit leaves of them."""
+
+    every: float
+    within: float
+    """about their mean at each time step"""
 
 
 class Around(NamedTuple):
@@ -118,12 +127,16 @@ def fit_quadratic_cost(
     whole = reduce(Moments.plus, folds)
     past = [Moments.of(*seen(batch)).together() for batch in older]
     support = reduce(Moments.plus, past) if past else None
-    z, y, live = seen(states)
-    around = Around(Surroundings.of(z, live), Samples.of(z, y, live, fold))
+
+    @cache
+    def around() -> Around:
+        z, y, live = seen(states)
+        return Around(Surroundings.of(z, live), Samples.of(z, y, live, fold))
+
     best, score = _chosen(folds, whole, support, around, settings)
     w = _fit_shared(whole.together(), support, [best], settings)[0]
     if best.around:
-        w = fitted_around(*around, [w], [None])[0]
+        w = fitted_around(*around(), [w], [None])[0]
     elif best.per_time:
         every = torch.arange(len(whole.n))
         w = _fit_each(_near(whole, every, settings.width), w)
@@ -140,7 +153,7 @@ def _chosen(
     folds: list[Moments],
     whole: Moments,
     support: Moments | None,
-    around: Around,
+    around: Callable[[], Around],
     settings: CostFit,
 ) -> tuple[Choice, Score]:
     """The best choice, on the episodes that its fits were not given; ``whole`` is of all folds.
@@ -157,19 +170,20 @@ def _chosen(
     weights = settings.older if support is not None else (0.0,)
     choices = [Choice(w, ridge, per_time=False) for w, ridge in product(weights, settings.ridge)]
     spread = float(judges.yy.sum())
-    if spread <= 1e-12 * float(judges.n.sum()):  # nothing to explain
+    nothing = ALIKE * float(judges.n.sum())
+    if spread <= nothing:
         return choices[0], Score(1.0, 1.0)
     fits = _fit_shared(given(judges, judges.together()), support, choices, settings)
     r2 = 1 - judges.error(fits).sum(dim=1) / spread
     shared, best, times = fits[int(r2.argmax())], choices[int(r2.argmax())], compared_steps(whole.n)
-    scale, errors = (_errors(folds, times, w) for w in (torch.zeros_like(shared), shared))
+    costs, together = (_squares(folds, times, w) for w in (torch.zeros_like(shared), shared))
 
     def score(fits_of_folds: Sequence[Tensor]) -> Score:
         """Of fits per time step, one for each fold that they were made without."""
-        wrong = _errors(folds, times, fits_of_folds)
-        left = float(wrong[0] / errors[0].clamp_min(1e-12))
-        within = 1 - float(wrong[1] / scale[1].clamp_min(1e-12))
-        return Score(1 - left * (1 - float(r2.max())), within)
+        left = _squares(folds, times, fits_of_folds)
+        ratio = left.every / max(together.every, 1e-12)
+        within = 1 - left.within / costs.within if costs.within > nothing else 1.0
+        return Score(1 - ratio * (1 - float(r2.max())), within)
 
     found = {best: score(list(shared))._replace(r2=float(r2.max()))}
     if settings.per_time == "never":
@@ -179,23 +193,23 @@ def _chosen(
     each = [_fit_each(given(own, every), w) for own, w in zip(near, shared, strict=True)]
     found[best._replace(per_time=True)] = score(each)
     winner = max(found, key=lambda choice: found[choice].r2)
-    if found[winner].within < ENOUGH and len(folds) > 1:
-        where, samples = around.surroundings.at(times), around.samples
-        local = fitted_around(where, samples, list(shared), range(len(folds)))
+    if found[winner].within < ENOUGH and float(whole.n.max()) >= LEAST_EPISODES:
+        surroundings, samples = around()
+        local = fitted_around(surroundings.at(times), samples, list(shared), range(len(folds)))
         found[best._replace(around=True)] = score(list(local))
         winner = max((winner, best._replace(around=True)), key=lambda choice: found[choice].within)
     return winner, found[winner]
 
 
-def _errors(
+def _squares(
     folds: list[Moments], times: Int[Tensor, " times"], fits: Sequence[Tensor] | Tensor
-) -> Float[Tensor, "2"]:
-    """Sums of squares of the errors of each fold's fit, and of what they differ by at a time."""
-    total = folds[0].n.new_zeros(2)
-    for fold, w in zip(folds, fits, strict=True):
-        judge = fold.each(itemgetter(times))
-        total += torch.stack([judge.error(w).sum(), judge.spread_of_errors(w).sum()])
-    return total
+) -> Squares:
+    """What the fit of each fold leaves of the costs that it is judged by."""
+    judges = [(fold.each(itemgetter(times)), w) for fold, w in zip(folds, fits, strict=True)]
+    error = torch.stack([judge.error(w) for judge, w in judges]).sum(dim=0)
+    surplus = torch.stack([judge.surplus(w) for judge, w in judges]).sum(dim=0)
+    count = torch.stack([judge.n for judge, _ in judges]).sum(dim=0).clamp_min(1.0)
+    return Squares(float(error.sum()), float((error - surplus.square() / count).sum()))
 
 
 def _fit_shared(

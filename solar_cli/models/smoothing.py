@@ -63,7 +63,7 @@ class SmoothedLDS(BayesianLDS):
         if task.observation.window != 1:
             raise UsageError(
                 "dynamics.posterior = 'smoother' sees single frames: set task.observation.window = "
-                f"1, not {task.observation.window}"
+                f"1, not {task.observation.window}, or the posterior to 'mean-field'"
             )
         self.hidden = settings.hidden
         self.shown = latent

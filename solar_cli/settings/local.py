@@ -199,7 +199,9 @@ class CostFit(Settings):
     )
     width: float = setting(5.0, "reach in time steps of a per-time fit", gt=0)
     per_time: Literal["chosen", "never"] = setting(
-        "chosen", "a fit per time step where held-out costs say so, or never"
+        "chosen",
+        "a fit per time step, of steps nearby or around the episodes, where held-out costs say so; "
+        "or never",
     )
     terminal: float = setting(3.0, "weight of the cost of the last state", gt=0)
 

@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from solar_cli.control import local_cost
+from solar_cli.control.convex_quadratic import Moments, least_squares
 from solar_cli.control.local_cost import RIDGE, Samples, Surroundings, fitted_around
-from solar_cli.control.quadratic_cost import fit_quadratic_cost
+from solar_cli.control.quadratic_cost import ROUNDS, fit_quadratic_cost
 from solar_cli.control.trajectories import Trajectories
 from solar_cli.inference import quadratics
 from solar_cli.settings.local import CostFit
@@ -43,29 +44,40 @@ def samples(z, y, fold=0):
     return Samples.of(torch.as_tensor(z), torch.as_tensor(y), live, folds)
 
 
-def test_surroundings_are_means_and_covariances_of_the_episodes():
-    """Over neighbouring time steps, each about its own mean; a little is added to the variances."""
+def shortened(survivors, since):
+    """(N, T): all episodes run until ``since``, and then only the first ``survivors``."""
+    live = np.ones((N, T), np.bool_)
+    live[survivors:, since:] = False
+    return live
+
+
+@pytest.mark.parametrize("live", [shortened(N, T), shortened(5, 4)], ids=["whole", "shortened"])
+def test_surroundings_are_means_and_covariances_of_the_episodes(live):
+    """Over neighbouring time steps, each about its own mean; a little is added to the variances.
+
+    What an episode showed after it ended says nothing.
+    """
     z = arriving()
-    found = around(z)
-    np.testing.assert_allclose(found.centre, z.mean(axis=0), atol=1e-12)
-    off = z - z.mean(axis=0)
-    each = np.einsum("ntm,ntk->tmk", off, off) / N
+    found = around(np.where(live[..., None], z, np.nan), live)
+    each = [z[live[:, t], t] for t in range(T)]
     for t in range(T):
+        np.testing.assert_allclose(found.centre[t], each[t].mean(axis=0), atol=1e-12)
         weight = np.exp(-0.5 * np.square((np.arange(T) - t) / local_cost.SMOOTHING))
-        expected = np.einsum("s,smk->mk", weight / weight.sum(), each)
+        sums = sum(w * len(s) * np.cov(s.T, bias=True) for w, s in zip(weight, each, strict=True))
+        expected = sums / (weight @ np.array([len(s) for s in each]))
         variances = local_cost.SHRINKAGE * np.diag(expected) + local_cost.LEAST_VARIANCE
         expected = expected + np.diag(variances)
         np.testing.assert_allclose(found.L[t] @ found.L[t].mT, expected, atol=1e-12)
 
 
-def test_episodes_that_ended_are_no_surroundings():
-    z = arriving()
-    live = np.ones((N, T), np.bool_)
-    live[5:, 4:] = False
-    shown = np.where(live[..., None], z, 1e6)
-    found, few = around(shown, live), around(z[:5])
-    np.testing.assert_allclose(found.centre[4:], few.centre[4:], atol=1e-12)
-    assert float(found.L.abs().max()) < 10
+def test_samples_are_of_steps_at_which_an_episode_ran():
+    z, live = arriving(), shortened(5, 4)
+    fold = torch.arange(N) % 4
+    costs = np.where(live, distance(z), 1e6)
+    some = Samples.of(torch.as_tensor(z), torch.as_tensor(costs), torch.as_tensor(live), fold)
+    assert len(some.y) == live.sum()
+    np.testing.assert_array_equal(some.y, distance(some.z.numpy()))
+    assert np.bincount(some.fold).tolist() == [live[k::4].sum() for k in range(4)]
 
 
 @pytest.mark.parametrize("reach", [0.8, 3.0])
@@ -118,10 +130,9 @@ def test_of_many_samples_some_are_drawn(monkeypatch):
     torch.testing.assert_close(some, samples(z, distance(z), fold), rtol=0, atol=0)
 
 
-def test_where_nobody_lived_the_shared_fit_goes_on():
-    z = arriving()
-    live = np.ones((N, T), np.bool_)
-    live[:, 5:] = False
+@pytest.mark.parametrize("survivors", [0, local_cost.LEAST_EPISODES - 1])
+def test_where_few_survive_the_shared_fit_goes_on(survivors):
+    z, live = arriving(), shortened(survivors, 5)
     shared = torch.as_tensor(np.array([0.6, 0.1, 0.4, 0.2, -0.3, 1.0]))
     found = fitted_around(around(z, live), samples(z, distance(z)), [shared], [None])[0]
     torch.testing.assert_close(found[5:], shared.expand(2, -1))
@@ -174,6 +185,57 @@ def test_a_quadratic_cost_needs_no_fit_around_the_episodes():
     found = fit(batch(lambda z: np.square(z).sum(axis=-1)))
     assert not found.choice.around
     assert found.within > 0.999
+
+
+@pytest.mark.parametrize("step", [4, 8])
+def test_a_few_survivors_of_one_fold_that_drift_away_harm_nothing(step):
+    """Without that fold there are no samples where they are, and no rounding is left of them."""
+    states = batch(distance, episodes=20, horizon=40)
+    live = torch.ones(states.live.shape, dtype=torch.bool)
+    live[torch.arange(20) % step != 0, 20:] = False
+    z = states.z.clone()
+    z[:, 21:] += torch.linspace(0, 50, 20).double()[None, :, None]
+    drifting = states._replace(z=z, live=live)
+    found = fit(drifting)
+    assert np.isfinite(found.within)
+    assert bool(torch.isfinite(found.model.C).all())
+    together = fit(drifting, per_time="never")
+    assert float(found.model.C[21:].abs().max()) < 3 * float(together.model.C.abs().max())
+
+
+@pytest.mark.parametrize("episodes", [1, 2, 5, local_cost.LEAST_EPISODES - 1])
+def test_few_episodes_tell_no_surroundings(episodes):
+    found = fit(batch(distance, episodes=episodes))
+    assert not found.choice.around
+    assert np.isfinite(found.within)
+
+
+def test_costs_that_only_time_tells_leave_nothing_to_explain():
+    found = fit(batch(lambda z: np.broadcast_to(np.arange(30.0), z.shape[:2]), episodes=20))
+    assert found.within == 1.0
+
+
+def test_of_fits_around_the_episodes_each_is_judged_by_what_it_was_not_given():
+    """The share is that of the same fits, made here, on the folds that they were made without."""
+    states = batch(distance, episodes=20, horizon=12)
+    found = fit(states, ridge=(1e-4,))
+    assert found.choice.around
+    z, folds = states.z[:, :-1].numpy(), np.arange(20) % 4
+    costs = states.costs.numpy()
+    y = (costs - costs.mean()) / costs.std(ddof=1)
+    wrong, where = np.zeros_like(y), around(z)
+    for k in range(4):
+        kept, judge = folds != k, folds == k
+        live = torch.ones(y[kept].shape, dtype=torch.bool)
+        own = Moments.of(torch.as_tensor(z[kept]), torch.as_tensor(y[kept]), live)
+        mean = own.together().mean()
+        penalty = 1e-4 * quadratics.squares(mean.xy.shape[-1]).to(mean.xy)
+        shared = least_squares(mean, penalty, torch.zeros_like(mean.xy), ROUNDS)
+        near = fitted_around(where, samples(z[kept], y[kept]), [shared], [None])[0]
+        x = quadratics.monomials(torch.as_tensor(z[judge]))
+        wrong[judge] = y[judge] - (x * near).sum(dim=-1).numpy()
+    left, total = (np.square(part - part.mean(axis=0)).sum() for part in (wrong, y))
+    assert found.within == pytest.approx(1 - left / total, abs=1e-6)
 
 
 def test_curvature_is_never_negative():

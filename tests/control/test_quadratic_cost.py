@@ -192,13 +192,12 @@ def test_r2_within_is_of_what_costs_differ_by_at_a_time_step():
     states = batch(lambda z, t: quadratic(z), noise=2.0)
     known = states.costs.numpy() - ALPHA * np.square(states.actions.numpy()).sum(axis=-1)
     design, fold = monomials(states), np.arange(N) % FOLDS
-    left = total = 0.0
+    wrong = np.zeros_like(known)
     for k in range(FOLDS):
         learned, judge = fold != k, fold == k
         w = np.linalg.lstsq(rows(design[learned]), known[learned].ravel(), rcond=None)[0]
-        wrong = design[judge] @ w - known[judge]
-        left += np.square(wrong - wrong.mean(axis=0)).sum()
-        total += np.square(known[judge] - known[judge].mean(axis=0)).sum()
+        wrong[judge] = design[judge] @ w - known[judge]
+    left, total = (np.square(part - part.mean(axis=0)).sum() for part in (wrong, known))
     found = fit(states, per_time="never", ridge=(0.0,))
     assert found.within == pytest.approx(1 - left / total, abs=1e-6)
 
