@@ -65,8 +65,8 @@ BUILT_IN = (
         "first state in the middle of one; local dynamics and costs of filtered means, on which "
         "the policy acts, in place of EM over smoothed ones; and the filter keeps the dynamics of "
         "the last training, so that a policy stays the same one. In both forms: a likelihood "
-        "that is calibrated, a cost fitted by convex least squares, and what is listed as extras; "
-        "the cards' variant paper has none of it.",
+        "that is calibrated, a cost fitted by convex least squares, at each time step where that "
+        "tells more, and what is listed as extras; the cards' variant paper has none of it.",
     ),
     MethodEntry(
         name="vae",
