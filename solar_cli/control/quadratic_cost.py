@@ -22,7 +22,7 @@ from operator import itemgetter
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from solar_cli.control.convex_quadratic import Moments, descended, least_squares
@@ -118,7 +118,9 @@ def fit_quadratic_cost(
     mean, scale = costs[states.live].mean(), costs[states.live].std().clamp_min(1e-9)
     fold = torch.arange(len(costs)) % min(FOLDS, len(costs))
 
-    def seen(batch: Trajectories) -> tuple[Tensor, Tensor, Tensor]:
+    def seen(
+        batch: Trajectories,
+    ) -> tuple[Float[Tensor, "N T m"], Float[Tensor, "N T"], Bool[Tensor, "N T"]]:
         """States, standardised costs, and where both count."""
         y = (_of_states(batch, action_cost) - mean) / scale
         return batch.z[:, :-1, :features], y, batch.live
@@ -159,7 +161,9 @@ def _chosen(
     """The best choice, on the episodes that its fits were not given; ``whole`` is of all folds.
 
     Fits per time step are compared with the best shared one at `compared_steps`. Their error in
-    all is taken to be its error in all, times the ratio of both at these steps.
+    all is taken to be its error in all, times the ratio of both at these steps. Fits around the
+    episodes are compared by what costs differ by at a time step, where the best of the others tells
+    too little of that.
     """
 
     def given(judges: Moments, every: Moments) -> Moments:
@@ -178,25 +182,24 @@ def _chosen(
     shared, best, times = fits[int(r2.argmax())], choices[int(r2.argmax())], compared_steps(whole.n)
     costs, together = (_squares(folds, times, w) for w in (torch.zeros_like(shared), shared))
 
-    def score(fits_of_folds: Sequence[Tensor]) -> Score:
-        """Of fits per time step, one for each fold that they were made without."""
-        left = _squares(folds, times, fits_of_folds)
+    def score(left: Squares) -> Score:
+        """Of what is left by fits that were each made without the fold that judges it."""
         ratio = left.every / max(together.every, 1e-12)
         within = 1 - left.within / costs.within if costs.within > nothing else 1.0
         return Score(1 - ratio * (1 - float(r2.max())), within)
 
-    found = {best: score(list(shared))._replace(r2=float(r2.max()))}
+    found = {best: score(together)._replace(r2=float(r2.max()))}
     if settings.per_time == "never":
         return best, found[best]
     near = [_near(fold, times, settings.width) for fold in folds]
     every = reduce(Moments.plus, near)
     each = [_fit_each(given(own, every), w) for own, w in zip(near, shared, strict=True)]
-    found[best._replace(per_time=True)] = score(each)
+    found[best._replace(per_time=True)] = score(_squares(folds, times, each))
     winner = max(found, key=lambda choice: found[choice].r2)
     if found[winner].within < ENOUGH and float(whole.n.max()) >= LEAST_EPISODES:
         surroundings, samples = around()
         local = fitted_around(surroundings.at(times), samples, list(shared), range(len(folds)))
-        found[best._replace(around=True)] = score(list(local))
+        found[best._replace(around=True)] = score(_squares(folds, times, local))
         winner = max((winner, best._replace(around=True)), key=lambda choice: found[choice].within)
     return winner, found[winner]
 

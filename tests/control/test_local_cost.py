@@ -100,7 +100,7 @@ def test_a_fit_is_a_weighted_regression_in_white_coordinates(monkeypatch, reach)
         towards = np.linalg.lstsq(
             monomials(grid), monomials(grid @ L.T + centre) @ shared.numpy(), rcond=None
         )[0]
-        penalty = RIDGE * (weight @ np.square(x)) + local_cost.LEAST_VARIANCE
+        penalty = RIDGE * (weight @ np.square(x)) + local_cost.LEAST_PENALTY
         left = (x * weight[:, None]).T @ x + np.diag(penalty)
         w = np.linalg.solve(left, (x * weight[:, None]).T @ costs + penalty * towards)
         C = quadratics.curvature(torch.as_tensor(w))
@@ -156,17 +156,13 @@ def fit(states, **settings):
     return fit_quadratic_cost(states, [], 0.0, CostFit.model_validate(settings), 4)
 
 
-ARRIVED = slice(10, None)
-"""time steps at which states stay around zero"""
-
-
-def within(found, judge, steps=slice(None)):
+def within(found, judge):
     """Share of what costs of other episodes differ by at a time step."""
     z, costs = judge.z[:, :-1].numpy(), judge.costs.numpy()
     C, c = found.model.C[:-1, :4, :4].numpy(), found.model.c[:-1, :4].numpy()
     wrong = costs - 0.5 * np.einsum("nti,tij,ntj->nt", z, C, z) - np.einsum("nti,ti->nt", z, c)
-    wrong, off = wrong[:, steps], (costs - costs.mean(axis=0))[:, steps]
-    return 1 - np.square(wrong - wrong.mean(axis=0)).sum() / np.square(off).sum()
+    left, total = (np.square(part - part.mean(axis=0)).sum() for part in (wrong, costs))
+    return 1 - left / total
 
 
 def test_a_sum_of_distances_is_fitted_around_the_episodes():
