@@ -136,7 +136,16 @@ class Scene:
     """A world that stands still."""
 
     def __init__(self, held, lower):
-        self.held, self.lower = lambda: held, lambda: lower
+        self.poses = held, lower
+
+    def reset(self, joints, lower):
+        """It stays as it was made."""
+
+    def held(self):
+        return self.poses[0]
+
+    def lower(self):
+        return self.poses[1]
 
     def image(self):
         return np.zeros((4, 4, 3), np.uint8)
@@ -147,7 +156,9 @@ def still(off=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.0), lower_turn=(0.0, 0.0, 0.0),
     axes = rotation(lower_turn)
     lower = Pose(np.array([0.6, 0.1, 0.0096]), axes)
     held = Pose(lower.position + axes @ np.add(off, (0, 0, facts.HEIGHT)), rotation(turn))
-    return Stacking(Scene(held, lower), 0.0, 0, action_cost)
+    scene = Stacking(Scene(held, lower), 0.0, 0, action_cost)
+    scene.reset(np.random.default_rng(0))
+    return scene
 
 
 def cost(scene, action=(0.0, 0.0, 0.0, 0.0)):
@@ -198,6 +209,14 @@ def test_stacked_means_seated(off, turn, stacked):
 def test_the_seat_goes_with_the_lower_brick():
     tipped = still((0.001, 0.0, 0.0), turn=(0.2, 0.0, 0.4), lower_turn=(0.2, 0.0, 0.4))
     assert tipped.measures() == {"distance": pytest.approx(0.1), "stacked": 1.0}
+
+
+def test_who_drags_the_lower_brick_along_gets_no_nearer_to_where_it_was_put():
+    scene = still()
+    world, along = scene._world, np.array([0.0, 0.02, 0.0])
+    world.poses = [Pose(pose.position + along, pose.rotation) for pose in world.poses]
+    assert cost(scene) == pytest.approx(2 * 0.02 + 0.1 * 0.02)
+    assert scene.measures() == {"distance": pytest.approx(0.0, abs=1e-9), "stacked": 1.0}
 
 
 def seen_at(point):
