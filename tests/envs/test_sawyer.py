@@ -133,7 +133,7 @@ def test_an_episode_has_the_same_bits_in_another_process(engine):
 
 
 class Scene:
-    """A world that stands still."""
+    """A world of two given poses."""
 
     def __init__(self, held, lower):
         self.poses = held, lower
@@ -156,13 +156,13 @@ def still(off=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.0), lower_turn=(0.0, 0.0, 0.0),
     axes = rotation(lower_turn)
     lower = Pose(np.array([0.6, 0.1, 0.0096]), axes)
     held = Pose(lower.position + axes @ np.add(off, (0, 0, facts.HEIGHT)), rotation(turn))
-    scene = Stacking(Scene(held, lower), 0.0, 0, action_cost)
-    scene.reset(np.random.default_rng(0))
-    return scene
+    stacking = Stacking(Scene(held, lower), 0.0, 0, action_cost)
+    stacking.reset(np.random.default_rng(0))
+    return stacking
 
 
-def cost(scene, action=(0.0, 0.0, 0.0, 0.0)):
-    return scene.step(np.array(action))[1]
+def cost(stacking, action=(0.0, 0.0, 0.0, 0.0)):
+    return stacking.step(np.array(action))[1]
 
 
 def test_no_file_stays_behind(monkeypatch, tmp_path):
@@ -206,17 +206,32 @@ def test_stacked_means_seated(off, turn, stacked):
     assert measures["distance"] == pytest.approx(100 * np.linalg.norm(off), abs=1e-9)
 
 
-def test_the_seat_goes_with_the_lower_brick():
+def test_the_seat_is_on_top_of_a_tipped_brick():
     tipped = still((0.001, 0.0, 0.0), turn=(0.2, 0.0, 0.4), lower_turn=(0.2, 0.0, 0.4))
     assert tipped.measures() == {"distance": pytest.approx(0.1), "stacked": 1.0}
 
 
-def test_who_drags_the_lower_brick_along_gets_no_nearer_to_where_it_was_put():
-    scene = still()
-    world, along = scene._world, np.array([0.0, 0.02, 0.0])
-    world.poses = [Pose(pose.position + along, pose.rotation) for pose in world.poses]
-    assert cost(scene) == pytest.approx(2 * 0.02 + 0.1 * 0.02)
-    assert scene.measures() == {"distance": pytest.approx(0.0, abs=1e-9), "stacked": 1.0}
+def test_who_drags_the_lower_brick_along_gets_no_nearer_to_the_goal():
+    stacking = still()
+    world, along, turn = stacking._world, np.array([0.0, 0.02, 0.0]), rotation((0.0, 0.0, 0.3))
+    world.poses = [Pose(pose.position + along, turn @ pose.rotation) for pose in world.poses]
+    assert cost(stacking) == pytest.approx(2 * 0.02 + 0.1 * 0.02 + 0.15 * 0.3)
+    assert stacking.measures() == {"distance": pytest.approx(0.0, abs=1e-9), "stacked": 1.0}
+
+
+def test_each_episodes_goal_stays_where_its_lower_brick_was_put(engine):
+    rows = task(engine, jitter=0.02)
+    rows.reset(streams(2))
+    put = rows.truth()[:, 4:]
+    for _ in range(25):
+        rows.step(script(rows.truth()))
+    for _ in range(10):
+        held = rows.truth()[:, :3]
+        _, costs = rows.step(np.tile([0.0, 1.0, 0.0, 0.0], (2, 1)))
+    assert (rows.truth()[:, 5] - put[:, 1] > 0.02).all()  # dragged along
+    off = held - np.column_stack([put, np.full(2, 1.5 * facts.HEIGHT)])
+    turned = costs - np.abs(off) @ [1.0, 2.0, 1.0] - 0.1 * np.linalg.norm(off, axis=1)
+    assert ((turned > 0.0) & (turned < 0.15 * 0.1)).all()
 
 
 def seen_at(point):

@@ -1,10 +1,10 @@
 """Sawyer Lego stacking from single images: put the brick in the hand onto one on the table.
 
 Appendix D's cost on a simulated arm; the paper's arm is real, and what it does not say of it is
-ours. The lower brick stands a little elsewhere in every episode, and may be pushed. Costs are of
-its seat where it was put, as the paper's goal is a place in the room: of a seat that is dragged
-along, an arm may drag it across the table and lose nothing. What is measured, and whether bricks
-are stacked, is of the seat where it is.
+ours. The lower brick stands a little elsewhere in every episode, and may be pushed. The goal of the
+cost is its seat at reset and stays there, as the paper's is a position of the end effector (6.3);
+one for each episode is ours. A goal that moved with the brick would let the arm drag it across the
+table at no cost. Measures are relative to the brick where it is now.
 """
 
 from __future__ import annotations
@@ -53,7 +53,8 @@ class Stacking:
         start = angles(np.array([*LOWER_PLACE, 1.5 * facts.HEIGHT]) + offset, yaw)
         self._world.reset(start, np.array([*place, turn]))
         self._control = VelocityControl(start)
-        self._put = self._world.lower()
+        lower = self._world.lower()
+        self._goal = Pose(seat(lower), lower.rotation)
         return self._frame()
 
     def step(self, action: Floats) -> tuple[Frames, float]:
@@ -68,7 +69,7 @@ class Stacking:
         return False
 
     def measures(self) -> dict[str, float]:
-        """``distance`` of the brick from its seat in cm, and whether it is ``stacked``: 1 or 0."""
+        """``distance`` of the brick from its seat, as that is now, in cm; ``stacked``: 1 or 0."""
         held, lower = self._world.held(), self._world.lower()
         off = lower.rotation.T @ (held.position - seat(lower))
         stacked = (
@@ -79,17 +80,20 @@ class Stacking:
         return {"distance": 100.0 * float(np.linalg.norm(off)), "stacked": float(stacked)}
 
     def truth(self) -> Floats:
-        """Of the held brick in m and rad, and of the lower one."""
+        """Of the held brick in m and rad, and of the lower one, over which the goal is at reset."""
         held, lower = self._world.held(), self._world.lower()
         yaw = np.arctan2(held.rotation[1, 0], held.rotation[0, 0])
         return np.array([*held.position, yaw, *lower.position[:2]])
 
     def _cost(self, action: Floats) -> float:
-        """|W (e - g)|_1 + 0.1 |e - g|_2 + 0.15 |angle to a valid orientation|."""
+        """|W (e - g)|_1 + 0.1 |e - g|_2 + 0.15 |angle to a valid orientation|.
+
+        e is the held brick's position, g the goal.
+        """
         held = self._world.held()
-        off = held.position - seat(self._put)
+        off = held.position - self._goal.position
         place = L1_WEIGHT * np.abs(AXES * off).sum() + L2_WEIGHT * np.linalg.norm(off)
-        turned = ANGLE_WEIGHT * angle_between(held, self._put)
+        turned = ANGLE_WEIGHT * angle_between(held, self._goal)
         return float(place + turned + self.action_cost * (action @ action))
 
     def _frame(self) -> Frames:
