@@ -1,6 +1,7 @@
 """The same code on a GPU: what it learns differs from the CPU's by rounding only."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,8 +26,8 @@ def as_the_engine_starts_workers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
 
 
-def learned(task: str, device: str, folder: Path) -> tuple[dict[str, float], np.ndarray]:
-    """Metrics of the first iteration, and the latents of its episodes in units of their std."""
+def learner_and_world(task: str, device: str, folder: Path) -> tuple[Any, Environment]:
+    """A learner of the task's smallest variant, and episodes to be collected."""
     sets = ["methods.solar.training.steps=20", *BACKEND.get(task, [])]
     [cell] = cells(load_card(task), "solar", [0], "smoke", sets)
     settings, streams = cell.configuration, Streams(0)
@@ -37,15 +38,29 @@ def learned(task: str, device: str, folder: Path) -> tuple[dict[str, float], np.
         settings.method, settings.task, streams.under("learner"), device, lambda *_: None
     )
     environment.begin(1)
-    metrics = learner.iterate(Experience(environment))
-    latents = learner.encode(collected_in(1, environment))
-    return metrics, latents / latents.std()
+    return learner, environment
 
 
 @pytest.mark.parametrize("task", card_names())
 def test_a_gpu_learns_what_the_cpu_learns(task, tmp_path):
-    on_cpu, expected = learned(task, "cpu", tmp_path / "cpu")
-    on_gpu, latents = learned(task, "cuda", tmp_path / "gpu")
-    np.testing.assert_allclose(latents, expected, atol=1e-3)
-    for name in ("elbo_reconstruction", "elbo_kl", "cost_r2", "one_step_r2"):
-        assert on_gpu[name] == pytest.approx(on_cpu[name], rel=0.02, abs=0.02), name
+    """Latents of a learner that was moved, and metrics of one that was trained there.
+
+    Weights are not compared: Adam's first steps have the size of the rate and a gradient's sign,
+    which rounding decides where there is next to none.
+    """
+    on_cpu, environment = learner_and_world(task, "cpu", tmp_path / "cpu")
+    expected = on_cpu.iterate(Experience(environment))
+    episodes = collected_in(1, environment)
+
+    moved, _ = learner_and_world(task, "cuda", tmp_path / "moved")
+    moved.load_state_dict(on_cpu.state_dict())
+    latents = on_cpu.encode(episodes)
+    np.testing.assert_allclose(moved.encode(episodes), latents, atol=1e-4 * latents.std())
+
+    on_gpu, environment = learner_and_world(task, "cuda", tmp_path / "gpu")
+    metrics = on_gpu.iterate(Experience(environment))
+    np.testing.assert_array_equal(collected_in(1, environment).frames, episodes.frames)
+    for name in ("elbo_reconstruction", "elbo_kl"):
+        assert metrics[name] == pytest.approx(expected[name], rel=2e-3, abs=2e-3), name
+    for name in ("cost_r2", "one_step_r2"):
+        assert metrics[name] == pytest.approx(expected[name], rel=0.02, abs=0.02), name
