@@ -139,7 +139,9 @@ class Training(Settings):
     kl_ramp: float = setting(0.3, "share of the steps over which it rises", ge=0, le=1)
     standard_normal: float = setting(0.05, "weight of a further KL to N(0, I)", ge=0)
     held_out: float = setting(0.15, "share of the collected episodes kept for scoring", gt=0, lt=1)
-    attempts: int = setting(3, "trainings at most, when a representation looks dead", ge=1)
+    attempts: int = setting(
+        3, "trainings at most, when a representation is dead or says little of the costs", ge=1
+    )
 
 
 class LocalFit(Settings):

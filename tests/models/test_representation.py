@@ -124,6 +124,23 @@ def test_a_living_representation_is_the_last_that_is_trained():
     assert metrics["discarded_trainings"] == metrics["seconds_discarded"] == 0.0
 
 
+def test_of_living_representations_that_say_little_of_costs_the_best_is_kept():
+    score = Scores(0.3, 0.6, 0.5)
+    model = make(score)
+    metrics = model.update(Collected(FIRST))
+    assert torch.equal(model.embed(FIRST), score.states[1])
+    assert metrics["discarded_trainings"] == 2.0
+    assert metrics["held_out_cost_r2"] == 0.6
+    assert metrics["alive"] == 1.0
+
+
+def test_one_that_says_enough_of_costs_is_the_last_that_is_trained():
+    score = Scores(0.69, 0.71, 0.9)
+    metrics = make(score).update(Collected(FIRST))
+    assert len(score.states) == 2
+    assert metrics["held_out_cost_r2"] == 0.71
+
+
 def test_judging_takes_what_encoding_takes_in_an_update_and_no_training(monkeypatch):
     clock, calls, fit = Mock(**{"monotonic.return_value": 0.0}), [], Trainer.fit
     encoded = LatentModel.encoded
