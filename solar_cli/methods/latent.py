@@ -62,7 +62,7 @@ class LatentLearner(ABC):
 
     @property
     def cost_fit(self) -> CostFit:
-        """How a quadratic cost is fitted: it tells whether a representation is alive."""
+        """How a quadratic cost is fitted: it tells whether a representation is good enough."""
         return CostFit()
 
     def fitted_cost(self, states: Trajectories, older: list[Trajectories]) -> FittedCost:

@@ -24,7 +24,7 @@ class Extra(NamedTuple):
 
 EXTRAS = (
     Extra("whitening of states", "whitening", off=False),
-    Extra("restarts of dead representations", "training.attempts", off=1),
+    Extra("restarts of poor representations", "training.attempts", off=1),
     Extra("going back to the best policy", "update.reject", off="never"),
     Extra("learning from what was taken back", "update.rejected_batches", 0, "update.reject"),
     Extra("bounds of the policy's noise", "update.std_floor", off=None),

@@ -140,7 +140,7 @@ class Training(Settings):
     standard_normal: float = setting(0.05, "weight of a further KL to N(0, I)", ge=0)
     held_out: float = setting(0.15, "share of the collected episodes kept for scoring", gt=0, lt=1)
     attempts: int = setting(
-        3, "trainings at most, when a representation is dead or says little of the costs", ge=1
+        3, "first trainings at most, until one explains 0.7 of the collected costs", ge=1
     )
 
 

@@ -259,7 +259,7 @@ def test_methods_says_where_one_departs_from_its_source_and_what_it_has_beyond(
     assert entries["rce"]["deviations"] in text
     assert entries["rce"]["source"] in text
     assert "learns from: image, state; needs: costs" in text
-    assert "restarts of dead representations (training.attempts = 3)" in text
+    assert "restarts of poor representations (training.attempts = 3)" in text
     off = "off unless a card says so: judging by episodes without noise (batches.noise_free = 0)"
     assert off in text
     assert "going back to the best policy" in entries["rce"]["extras"]

@@ -1,4 +1,4 @@
-"""The same code on a GPU: what it learns differs from the CPU's by rounding only."""
+"""The same code on a GPU: what it computes differs from the CPU's by rounding only."""
 
 from pathlib import Path
 from typing import Any

@@ -125,13 +125,22 @@ def test_a_living_representation_is_the_last_that_is_trained():
 
 
 def test_of_living_representations_that_say_little_of_costs_the_best_is_kept():
-    score = Scores(0.3, 0.6, 0.5)
+    score = Scores(0.15, 0.3, 0.2)
     model = make(score)
     metrics = model.update(Collected(FIRST))
     assert torch.equal(model.embed(FIRST), score.states[1])
     assert metrics["discarded_trainings"] == 2.0
-    assert metrics["held_out_cost_r2"] == 0.6
+    assert metrics["held_out_cost_r2"] == 0.3
     assert metrics["alive"] == 1.0
+
+
+def test_a_living_representation_ranks_above_every_dead_one():
+    def candidate(alive, **metrics):
+        return representation.Candidate(alive, metrics, {})
+
+    living = candidate(True, held_out_cost_r2=0.2, held_out_elbo=-50.0)
+    dead = candidate(False, held_out_cost_r2=0.05, held_out_elbo=7000.0)
+    assert living.rank() > dead.rank()
 
 
 def test_one_that_says_enough_of_costs_is_the_last_that_is_trained():
@@ -302,7 +311,7 @@ def checkpoints(batches: list[Collected], **changes) -> tuple[list[Any], str, li
     return saved, digest(model.state_dict()), metrics
 
 
-SCORES = (0.01, 0.02, 0.9)
+SCORES = (0.01, 0.3, 0.9)
 
 
 def without_seconds(metrics: dict[str, float]) -> dict[str, float]:
@@ -321,7 +330,7 @@ def test_an_update_stopped_at_any_pulse_goes_on_with_the_same_bits(
     batches = [Collected(FIRST), Collected(FIRST, second)]
     changes = {"fine_tune_steps": fine_tune_steps, "attempts": 3}
     saved, expected, metrics = checkpoints(batches, **changes)
-    assert len(saved) == 6 + fine_tune_steps // 2  # three attempts, two of them dead
+    assert len(saved) == 6 + fine_tune_steps // 2  # three attempts, one dead and one poor
     assert metrics[0]["discarded_trainings"] == 2.0
     if fine_tune_steps:
         assert metrics[1]["fine_tuning_taken_back"] == float(kills)
