@@ -43,10 +43,11 @@ def learner_and_world(task: str, device: str, folder: Path) -> tuple[Any, Enviro
 
 @pytest.mark.parametrize("task", card_names())
 def test_a_gpu_learns_what_the_cpu_learns(task, tmp_path):
-    """Latents of a learner that was moved, and metrics of one that was trained there.
+    """A learner that was moved there, and one that was trained there.
 
-    Weights are not compared: Adam's first steps have the size of the rate and a gradient's sign,
-    which rounding decides where there is next to none.
+    Trained ones differ by more than rounding: Adam's first steps have the size of the rate and a
+    gradient's sign, which rounding decides where there is next to none. On an H200 latents differed
+    by .007 of their std on Sawyer, and by less than .001 on every other task.
     """
     on_cpu, environment = learner_and_world(task, "cpu", tmp_path / "cpu")
     expected = on_cpu.iterate(Experience(environment))
@@ -60,6 +61,7 @@ def test_a_gpu_learns_what_the_cpu_learns(task, tmp_path):
     on_gpu, environment = learner_and_world(task, "cuda", tmp_path / "gpu")
     metrics = on_gpu.iterate(Experience(environment))
     np.testing.assert_array_equal(collected_in(1, environment).frames, episodes.frames)
+    np.testing.assert_allclose(on_gpu.encode(episodes), latents, atol=0.02 * latents.std())
     for name in ("elbo_reconstruction", "elbo_kl"):
         assert metrics[name] == pytest.approx(expected[name], rel=2e-3, abs=2e-3), name
     for name in ("cost_r2", "one_step_r2"):
