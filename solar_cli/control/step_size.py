@@ -21,19 +21,22 @@ class StepSize:
     low: float = 0.3
     high: float = 2.0
 
-    def after(self, predicted: float, actual: float) -> StepSize:
+    def after(self, predicted: float, actual: float, error: float) -> StepSize:
         """The step after an update that was predicted to lower the cost by ``predicted``.
 
-        ``actual`` is the measured fall. If the model's error grows as the square of the step m
-        (gain = p m - e m^2), the best step is m p / (2 (p - actual)): gps' rule. Half of
-        what was predicted keeps the step, three quarters or more double it, nothing or a rise
-        halve it. A prediction that is no improvement, or not finite, teaches nothing.
+        ``actual`` is the measured fall and ``error`` its standard error. If the model's error grows
+        as the square of the step m (gain = p m - e m^2), the best step is m p / (2 (p - actual)):
+        gps' rule. Half of what was predicted keeps the step, three quarters or more double it,
+        nothing or a rise halve it; but only what noise does not explain makes a step smaller, or
+        falls of a few noisy episodes hold it at its least (Sawyer, true state, six seeds: 86 % of
+        episodes stacked at 222 without this, 95 % with). A prediction that is no improvement, or
+        not finite, teaches nothing.
         """
         if not (predicted > 0 and math.isfinite(predicted) and math.isfinite(actual)):
             return self
-        shortfall = (predicted - actual) / predicted
-        enough = shortfall <= 1 / (2 * LARGEST_FACTOR)
-        factor = LARGEST_FACTOR if enough else max(LEAST_FACTOR, 1 / (2 * shortfall))
+        factor = _factor((predicted - actual) / predicted)
+        if factor < 1:
+            factor = min(_factor((predicted - actual - error) / predicted), 1.0)
         return self._times(factor)
 
     def after_rejection(self) -> StepSize:
@@ -42,3 +45,10 @@ class StepSize:
 
     def _times(self, factor: float) -> StepSize:
         return replace(self, multiplier=min(max(self.multiplier * factor, self.low), self.high))
+
+
+def _factor(shortfall: float) -> float:
+    """By how much the step changes after an update that fell short by this share of its promise."""
+    if shortfall <= 1 / (2 * LARGEST_FACTOR):
+        return LARGEST_FACTOR
+    return max(LEAST_FACTOR, 1 / (2 * shortfall))

@@ -90,7 +90,8 @@ class TrustRegion:
             step = self.step.after_rejection()
             rejected = (*self.rejected, *tried.batches)
             return replace(self, current=self.best, step=step, kept=kept, rejected=rejected)
-        step = self.step.after(self.promised, kept)
+        error = math.hypot(tried.error, self.current.error)
+        step = self.step.after(self.promised, kept, error)
         if self.promised < self._share(LEFT_TO_GAIN):
             step = min(step, self.step, key=lambda step: step.multiplier)
         return replace(

@@ -25,12 +25,29 @@ from solar_cli.control.step_size import StepSize
     ],
 )
 def test_factor_follows_the_share_of_the_prediction_that_came_true(predicted, actual, multiplier):
-    assert StepSize().after(predicted, actual).multiplier == pytest.approx(multiplier)
+    assert StepSize().after(predicted, actual, error=0.0).multiplier == pytest.approx(multiplier)
+
+
+@pytest.mark.parametrize(
+    ("actual", "error", "multiplier"),
+    [
+        (0.0, 3.0, 10 / 14),  # 10 / (2 x 7): what is beyond the noise
+        (0.0, 5.0, 1.0),
+        (0.0, 9.0, 1.0),  # noise is no reason to go further
+        (-10.0, 2.0, 0.5),
+        (5.0, 2.0, 1.0),
+        (6.0, 9.0, 1.25),  # nor does it change a step that grows
+        (6.0, 0.0, 1.25),
+        (7.5, 9.0, 2.0),
+    ],
+)
+def test_only_what_noise_does_not_explain_makes_a_step_smaller(actual, error, multiplier):
+    assert StepSize().after(10.0, actual, error).multiplier == pytest.approx(multiplier)
 
 
 def test_step_maximises_the_gain_when_the_model_errs_by_the_square_of_the_step():
     p, e, m = 8.0, 2.5, 1.3
-    after = StepSize(m).after(predicted=p * m, actual=p * m - e * m * m)
+    after = StepSize(m).after(predicted=p * m, actual=p * m - e * m * m, error=0.0)
     gains = {x / 1000: p * x / 1000 - e * (x / 1000) ** 2 for x in range(300, 2001)}
     assert after.multiplier == pytest.approx(max(gains, key=gains.__getitem__), abs=1e-3)
 
@@ -38,7 +55,7 @@ def test_step_maximises_the_gain_when_the_model_errs_by_the_square_of_the_step()
 def test_multiplier_stays_within_its_bounds():
     step = StepSize()
     for _ in range(5):
-        step = step.after(1.0, 1.0)
+        step = step.after(1.0, 1.0, error=0.0)
     assert step.multiplier == 2.0
     for _ in range(5):
         step = step.after_rejection()
