@@ -1,7 +1,7 @@
 """Which episodes an update starts from: the newest ones, or the best so far when those are worse.
 
-Costs of episodes are noisy, so a batch counts as worse only by its standard error. Judged by
-collected episodes alone.
+Costs of episodes are noisy, so a batch counts as worse only by its standard error, and makes a step
+smaller only by what that does not explain. Judged by collected episodes alone.
 """
 
 from __future__ import annotations

@@ -214,7 +214,9 @@ class PolicyUpdate(Settings):
     kl_step: Positive | Literal["unbounded"] = setting(
         0.5, "nats a time step that the trajectory distribution may move"
     )
-    multiplier: tuple[Positive, Positive] = setting((0.3, 4.0), "bounds of the adaptive step size")
+    multiplier: tuple[Positive, Positive] = setting(
+        (0.3, 4.0), "bounds of what kl_step is multiplied by, from what updates promised and gave"
+    )
     linearise: bool = setting(True, "line 6 of Algorithm 1, when e(s) has changed")
     reject: Annotated[float, Field(ge=0)] | Literal["never"] = setting(
         1.0, "standard errors by which a batch may be worse than the best before going back"
