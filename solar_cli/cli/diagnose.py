@@ -58,9 +58,9 @@ def command(
     from solar_cli.cli.shadowing import tell_misspelt, tell_shadowed
     from solar_cli.experiment.engine import ENVIRONMENT
 
-    [cell] = cells_of([task], [method], f"{seed}:{seed + 1}", variant, sets or (), None)
     tell_shadowed([task])
     tell_misspelt([task])
+    [cell] = cells_of([task], [method], f"{seed}:{seed + 1}", variant, sets or (), None)
     # Before torch is imported: the same bits as a worker has.
     os.environ.update(ENVIRONMENT)
 

@@ -99,10 +99,10 @@ def command(
     from solar_cli.experiment.matrix import plan
     from solar_cli.settings import parse_budget
 
-    matrix = cells_of(tasks, methods, seeds, variant, sets or (), label)
-    wanted = parse_budget(budget)
     tell_shadowed(tasks)
     tell_misspelt(tasks)
+    matrix = cells_of(tasks, methods, seeds, variant, sets or (), label)
+    wanted = parse_budget(budget)
     with planning_store(db) if dry_run else _store(db) as store:
         plans = plan(store, matrix, wanted, redo=redo, retry=retry)
         work = [planned.cell for planned in plans if planned.is_work]

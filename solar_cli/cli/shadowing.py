@@ -20,11 +20,17 @@ def card_files(name: str) -> list[Path]:
 
 
 def tell_shadowed(names: Iterable[str]) -> None:
-    """One line on standard error for each card that hides a built-in one."""
+    """One line on standard error for each card that hides a built-in one, or has the name of one.
+
+    A card by its path has the name of its file, under which its results are stored.
+    """
     for name in dict.fromkeys(names):
-        files = card_files(name)
+        path = Path(name)
+        by_path = [path] if name.endswith(".toml") and path.is_file() else []
+        task = path.stem if by_path else name
+        files = by_path + card_files(task)[-1:] if by_path else card_files(name)
         if len(files) > 1 and not files[0].samefile(files[1]):
-            complain(f"solar: note: {files[0]} is used instead of the built-in card {name!r}")
+            complain(f"solar: note: {files[0]} is used instead of the built-in card {task!r}")
 
 
 def tell_misspelt(names: Iterable[str]) -> None:

@@ -133,7 +133,8 @@ def _print_changed(changed: list[Line]) -> None:
     from solar_cli.cli.configuration import shown
 
     rows = [(line.path, shown(line.value), line.origin) for line in changed]
-    print_table(("setting", "value", "from"), rows, "Different from the method's defaults")
+    if rows:
+        print_table(("setting", "value", "from"), rows, "Different from the method's defaults")
 
 
 def _print_attempts(attempts: list[AttemptRecord]) -> None:

@@ -84,6 +84,14 @@ def _free(viewer: Any) -> None:
     viewer.free()
 
 
+class EnvironmentFails(SolarError):
+    """The environment's own code raised an error, or gave what is no observation."""
+
+    def __init__(self, what: str) -> None:
+        super().__init__(f"{what}: an error of the environment's own code, which the log shows")
+        self.what = what
+
+
 class GymnasiumEpisode:
     """A `Simulation`: one environment, used again for one episode after another."""
 
@@ -167,6 +175,8 @@ class GymnasiumEpisode:
             observed = np.array(observation, np.float64).ravel()
             if len(self._observed) not in (0, len(observed)):
                 raise ValueError(f"{len(observed)} numbers observed, {len(self._observed)} before")
+            if len(odd := np.flatnonzero(~np.isfinite(observed))):
+                raise ValueError(f"entry {odd[0]} of its observation is {observed[odd[0]]}")
             self._observed = observed
         if self._camera is None:
             self._frame = self._observed.astype(np.float32)
@@ -176,10 +186,7 @@ class GymnasiumEpisode:
     def _failure(self, where: str, error: Exception) -> SolarError:
         if isinstance(error, SolarError):
             return error
-        return SolarError(
-            f"{self._parameters.id} fails {where} ({cause(error)}): an error of the environment's "
-            "own code, which the log shows"
-        )
+        return EnvironmentFails(f"{self._parameters.id} fails {where} ({cause(error)})")
 
     def _scale_by(self, space: Any, settings: TaskSettings) -> None:
         """Take over the box of actions. Raises `UsageError` for what is none."""
@@ -244,10 +251,7 @@ def build(settings: TaskSettings) -> LoopTask:
             f"task.observation.window = {seen.window}: longer than an episode of task.horizon = "
             f"{settings.horizon} steps; change one"
         )
-    first = GymnasiumEpisode(parameters, settings, camera)
-    first.reset(np.random.default_rng(0))
-    first.step(np.zeros(settings.action.size))
-    first.check_info()
+    _try(GymnasiumEpisode(parameters, settings, camera), settings)
     return LoopTask(lambda: GymnasiumEpisode(parameters, settings, camera), settings)
 
 
@@ -273,10 +277,22 @@ def drawable(settings: TaskSettings, rows: int) -> TaskSettings:
     parameters = validated(Parameters, settings.parameters, where, "task.parameters")
     seen = Observation(kind="image", height=rows, width=rows, channels=3)
     shown, camera = settings.model_copy(update={"observation": seen}), Camera(seen)
-    GymnasiumEpisode(parameters, shown, camera).reset(np.random.default_rng(0))
+    _try(GymnasiumEpisode(parameters, shown, camera), shown)
     high, wide = camera.rendered
     seen = seen.model_copy(update={"width": round(rows * wide / high)})
     return settings.model_copy(update={"observation": seen})
+
+
+def _try(episode: GymnasiumEpisode, settings: TaskSettings) -> None:
+    """Raise `UsageError` where an environment fails from the start, as for want of a package."""
+    try:
+        episode.reset(np.random.default_rng(0))
+        episode.step(np.zeros(settings.action.size))
+    except EnvironmentFails as error:
+        raise UsageError(
+            f"task.parameters.id: {error.what}: install what it needs, or choose another"
+        ) from error
+    episode.check_info()
 
 
 def _make(parameters: Parameters, settings: TaskSettings) -> Any:

@@ -187,7 +187,7 @@ def resolve(
         ("card", _with_method(card, card.tables, method_name)),
         (f"variant {variant}", _with_method(card, overrides, method_name, f"variants.{variant}.")),
     ]
-    layers += [("--set", assignment(text)) for text in sets]
+    layers += [("--set", tree) for tree in _assignments(sets)]
     merged: Table = {"method": _own_defaults(settings_class(entry))}
     origins: dict[str, str] = {}
     for origin, layer in layers:
@@ -279,6 +279,19 @@ def _check_methods(layer: Table, origin: str, card: Card) -> None:
     if origin == "--set":
         for name in named:
             method(name)
+
+
+def _assignments(sets: Sequence[str]) -> list[Table]:
+    """Each `assignment`. Raises `UsageError` where two are of the same path."""
+    paths: set[str] = set()
+    trees = []
+    for text in sets:
+        trees.append(assignment(text))
+        path = ".".join(part.strip() for part in text.partition("=")[0].split("."))
+        if path in paths:
+            raise UsageError(f"--set {text!r}: {path} is set twice; keep one of them")
+        paths.add(path)
+    return trees
 
 
 def assignment(text: str) -> Table:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from solar_cli.settings.schema import Settings, setting
 
@@ -17,6 +17,12 @@ class Observation(Settings):
     width: int = setting(1, "columns of an image in pixels; entries of a state", ge=1)
     channels: int = setting(1, "channels of one frame", ge=1)
     window: int = setting(1, "frames an observation holds: this one and those before", ge=1, le=16)
+
+    @model_validator(mode="after")
+    def _an_image_has_a_size(self) -> Self:
+        if self.kind == "image" and not {"height", "width"} <= self.model_fields_set:
+            raise ValueError("an image needs height and width")
+        return self
 
     @property
     def frame_shape(self) -> tuple[int, ...]:

@@ -373,16 +373,17 @@ def test_a_bad_card_does_not_hide_the_others(solar: Solar, tmp_path: Path) -> No
 def test_a_card_that_hides_a_built_in_one_is_told_of(solar: Solar, tmp_path: Path) -> None:
     from solar_cli.settings import load_card
 
-    original = load_card("nav").path.read_text()
+    original_path = load_card("nav").path
     (tmp_path / "tasks").mkdir()
-    (tmp_path / "tasks" / "nav.toml").write_text(original)
+    (tmp_path / "tasks" / "nav.toml").write_text(original_path.read_text())
     run = ("run", "--method", "solar", "--dry-run", "--task")
     for command in (("tasks",), ("tasks", "nav"), (*run, "nav")):
         done = solar(*command)
         assert (done.code, done.err.count("\n")) == (0, 1), done
         assert "tasks/nav.toml is used instead of the built-in card 'nav'" in done.err
     assert solar(*run, "nav-fixed").err == ""
-    assert solar(*run, "tasks/nav.toml").err == ""
+    assert "tasks/nav.toml is used instead" in solar(*run, "tasks/nav.toml").err
+    assert solar(*run, str(original_path)).err == ""
 
 
 def test_a_card_that_misspells_a_method_is_told_of(solar: Solar, tmp_path: Path) -> None:
@@ -398,6 +399,22 @@ def test_a_card_that_misspells_a_method_is_told_of(solar: Solar, tmp_path: Path)
         assert (done.code, done.err.count("\n")) == (0, 2), done
         assert "tasks/mine.toml: 'methods.sollar'" in done.err
         assert "did you mean 'vae'?" in done.err
+
+
+def test_a_misspelt_method_explains_the_settings_that_are_missing(
+    solar: Solar, tmp_path: Path
+) -> None:
+    from solar_cli.settings import load_card
+
+    card, original = tmp_path / "mine.toml", load_card("pusher").path.read_text()
+    task_alone, _, _ = original.partition("[methods.")
+    card.write_text(f"{task_alone}[methods.sollar]\nbudget = {{ desk = 1, full = 2 }}\n")
+    for command in ("run", "diagnose"):
+        done = solar(command, "--method", "solar", "--task", str(card))
+        assert done.code == 2
+        assert "'methods.sollar' has no effect" in done.err
+        assert "did you mean 'solar'?" in done.err
+        assert "'methods.solar.batches': Field required" in done.err
 
 
 def test_show_says_where_the_time_went(solar: Solar, stored: Stored) -> None:

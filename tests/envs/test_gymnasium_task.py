@@ -28,8 +28,11 @@ class Walk(gymnasium.Env):
     observation_space = spaces.Box(-np.inf, np.inf, (2, 1))
     action_space = spaces.Box(LOW, HIGH)
 
-    def __init__(self, fails_at=None, truncates_at=None, grows_at=None, render_mode=None):
-        self.fails_at, self.truncates_at, self.grows_at = fails_at, truncates_at, grows_at
+    def __init__(
+        self, fails_at=None, truncates_at=None, grows_at=None, odd_at=None, render_mode=None
+    ):
+        self.fails_at, self.truncates_at = fails_at, truncates_at
+        self.grows_at, self.odd_at = grows_at, odd_at
         self.render_mode = render_mode
 
     def reset(self, *, seed=None, options=None):
@@ -47,6 +50,8 @@ class Walk(gymnasium.Env):
         told = {"effort": float(np.square(action).sum())}
         over = bool(self.place[0] > 2.0)
         seen = self.place[:, None] if self.steps != self.grows_at else np.zeros((3, 1))
+        if self.steps == self.odd_at:
+            seen = seen * np.array([[1.0], [np.inf]])
         return seen, self.place[1], over, self.steps == self.truncates_at, told
 
     def render(self):
@@ -466,8 +471,16 @@ def test_what_does_not_fit_is_refused_in_one_line(changes, parts):
 
 
 def test_what_is_no_picture_is_refused():
-    with pytest.raises(SolarError, match=r"Test/Plain-v0 fails at a reset .*renders str, not an"):
+    with pytest.raises(UsageError, match=r"Test/Plain-v0 fails at a reset .*renders str, not an"):
         build_task(card("Test/Plain-v0", image=True))
+
+
+def test_an_environment_that_fails_from_the_start_is_a_card_to_correct():
+    cause = r"task.parameters.id: Test/Walk-v0 fails in step 1 .*the floor is gone.*install what"
+    with pytest.raises(UsageError, match=cause):
+        build_task(card(make={"fails_at": 1}))
+    with pytest.raises(UsageError, match=r"fails at a reset .*renders str.*install what"):
+        drawable(card("Test/Plain-v0"), 8)
 
 
 def test_a_state_is_had_without_rendering():
@@ -490,6 +503,14 @@ def test_an_observation_that_changes_its_size_says_where():
     cause = r"Test/Walk-v0 fails in step 3 of an episode \(ValueError: 3 numbers observed, 2 before"
     with pytest.raises(SolarError, match=cause):
         rolled(card(make={"grows_at": 3}), np.full((6, 2), -1.5))
+
+
+@pytest.mark.parametrize("image", [False, True], ids=["state", "image"])
+def test_an_observation_that_is_not_finite_says_which_entry_and_where(image):
+    cause = r"fails in step 3 of an episode \(ValueError: entry 1 of its observation is -?inf"
+    measured = {"measures": {"height": {"entry": 1}}}
+    with pytest.raises(SolarError, match=cause):
+        rolled(card(image=image, make={"odd_at": 3}, **measured), np.full((6, 2), -1.5))
 
 
 @mujoco_draws_here
