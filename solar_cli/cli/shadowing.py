@@ -25,12 +25,11 @@ def tell_shadowed(names: Iterable[str]) -> None:
     A card by its path has the name of its file, under which its results are stored.
     """
     for name in dict.fromkeys(names):
-        path = Path(name)
-        by_path = [path] if name.endswith(".toml") and path.is_file() else []
-        task = path.stem if by_path else name
-        files = by_path + card_files(task)[-1:] if by_path else card_files(name)
-        if len(files) > 1 and not files[0].samefile(files[1]):
-            complain(f"solar: note: {files[0]} is used instead of the built-in card {task!r}")
+        by_path = name.endswith(".toml")
+        used = Path(name) if by_path else next(iter(card_files(name)), Path(name))
+        built_in = card_folders()[-1] / f"{used.stem}.toml"
+        if used.is_file() and built_in.is_file() and not used.samefile(built_in):
+            complain(f"solar: note: {used} is used instead of the built-in card {used.stem!r}")
 
 
 def tell_misspelt(names: Iterable[str]) -> None:
