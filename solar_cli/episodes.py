@@ -15,7 +15,8 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from solar_cli.envs.task import Task
+from solar_cli.envs.task import Frames, Task
+from solar_cli.pulse import Diverged
 from solar_cli.settings import TaskSettings
 from solar_cli.streams import Streams
 
@@ -162,7 +163,10 @@ def roll_out(
     resets: Sequence[np.random.Generator],
     noise: np.random.Generator | None,
 ) -> Evaluation:
-    """Run one episode for each reset stream, as many side by side as the task allows."""
+    """Run one episode for each reset stream, as many side by side as the task allows.
+
+    Raises `Diverged` where a state that a task shows is not finite.
+    """
     size = task.at_once or len(resets)
     groups = [resets[i : i + size] for i in range(0, len(resets), size)]
     return Evaluation.joined([_run(task, settings, policy, group, noise) for group in groups])
@@ -182,6 +186,7 @@ def _run(
     count, horizon, window = len(resets), settings.horizon, settings.observation.window
     index = window_indices(horizon, window)
     first = task.reset(resets)
+    _require_finite(first, np.ones(count, np.bool_), 0)
     frames = np.empty((count, horizon + 1, *first.shape[1:]), first.dtype)
     frames[:, 0] = first
     actions = np.empty((count, horizon, settings.action.size))
@@ -194,6 +199,7 @@ def _run(
         wanted, means[:, t], state = policy.act(frames[:, index[t]], t, state)
         actions[:, t] = np.clip(wanted, -settings.action.bound, settings.action.bound)
         frames[:, t + 1], costs[:, t] = task.step(actions[:, t])
+        _require_finite(frames[:, t + 1], lengths > t, t + 1)
         actions[lengths <= t, t] = means[lengths <= t, t] = 0.0
         lengths[task.ended() & (lengths > t)] = t + 1
         measured, truth = _ground_truth(task)
@@ -205,6 +211,18 @@ def _run(
         {name: np.stack([step[name] for step in measures], axis=1) for name in sorted(names)},
         *_stacked(truths, count, task.truth_names),
     )
+
+
+def _require_finite(frames: Frames, live: NDArray[np.bool_], t: int) -> None:
+    """Raise `Diverged` for states (N, S) at step ``t`` that no policy can act on.
+
+    Images always are finite; what is shown after the end of an episode, not ``live``, is nobody's.
+    """
+    if frames.dtype.kind != "f" or np.isfinite(frames).all():
+        return
+    if len(odd := np.argwhere(~np.isfinite(frames) & live[:, None])):
+        entry, value = odd[0, 1], frames[tuple(odd[0])]
+        raise Diverged(f"entry {entry} of the observed state is {value} at step {t} of an episode")
 
 
 def _stacked(

@@ -12,4 +12,4 @@ The caller may save ``state_dict()`` then, or raise to stop: at a pulse the stat
 
 
 class Diverged(Exception):
-    """Learning has left the realm of finite numbers; the message says where."""
+    """A task or its learner has left the realm of finite numbers; the message says where."""

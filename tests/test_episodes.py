@@ -15,6 +15,7 @@ from solar_cli.envs import build_task
 from solar_cli.episodes import Batch, Episodes, Evaluation, evaluate, roll_out, window_indices
 from solar_cli.errors import SolarError
 from solar_cli.experience import HELD, Environment, Experience
+from solar_cli.pulse import Diverged
 from solar_cli.settings import TaskSettings, load_card
 from solar_cli.streams import Streams
 
@@ -205,6 +206,21 @@ def test_executed_actions_are_clipped_and_costs_are_theirs(settings: TaskSetting
     # Frames are float32, so states read off them are exact to 1e-7 only.
     np.testing.assert_allclose(episodes.costs, x[:, :-1] + 10 * episodes.actions[..., 0], atol=1e-5)
     np.testing.assert_allclose(np.diff(x), episodes.actions[..., 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("value", [np.nan, -np.inf])
+@pytest.mark.parametrize("step", [0, 3, T])
+def test_a_state_that_is_not_finite_meets_no_policy(settings: TaskSettings, value, step):
+    class Spoilt(Sums):
+        def frames(self):
+            frames = super().frames()
+            frames[-1, 1] = value if self.step_number == step else frames[-1, 1]
+            return frames
+
+    policy = Pull()
+    with pytest.raises(Diverged, match=f"entry 1 of the observed state is {value} at step {step} "):
+        roll_out(Spoilt(), settings, policy, [np.random.default_rng(i) for i in (0, 1)], None)
+    assert len(policy.shown) == step
 
 
 def test_a_summary_has_one_number_an_episode():

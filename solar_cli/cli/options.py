@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from solar_cli.errors import SolarError
+from solar_cli.errors import SolarError, UsageError
 
 
 def complete_task(incomplete: str) -> list[str]:
@@ -37,6 +37,20 @@ def complete_variant(incomplete: str) -> list[str]:
         except SolarError:
             continue  # that card is reported when it is used
     return sorted(names)
+
+
+def each_once(sets: list[str] | None) -> list[str] | None:
+    """The assignments of ``--set``. Raises `UsageError` where two are of one setting."""
+    if sets:
+        from solar_cli.settings.card import assignment, leaves
+
+        known: set[str] = set()
+        for text in sets:
+            paths = set(leaves(assignment(text)))
+            if twice := known & paths:
+                raise UsageError(f"--set {text!r}: {min(twice)} is set twice; keep one of them")
+            known |= paths
+    return sets
 
 
 Database = Annotated[
@@ -85,6 +99,7 @@ Sets = Annotated[
         metavar="PATH=TOML",
         help="Change one setting, by its path in the card; repeats.",
         show_default=False,
+        callback=each_once,
     ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]

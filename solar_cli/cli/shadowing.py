@@ -25,11 +25,11 @@ def tell_shadowed(names: Iterable[str]) -> None:
     A card by its path has the name of its file, under which its results are stored.
     """
     for name in dict.fromkeys(names):
-        by_path = name.endswith(".toml")
-        used = Path(name) if by_path else next(iter(card_files(name)), Path(name))
-        built_in = card_folders()[-1] / f"{used.stem}.toml"
-        if used.is_file() and built_in.is_file() and not used.samefile(built_in):
-            complain(f"solar: note: {used} is used instead of the built-in card {used.stem!r}")
+        files = [Path(name)] if name.endswith(".toml") else card_files(name)
+        for used in files[:1]:
+            built_in = card_folders()[-1] / used.name
+            if used.is_file() and built_in.is_file() and not used.samefile(built_in):
+                complain(f"solar: note: {used} is used instead of the built-in card {used.stem!r}")
 
 
 def tell_misspelt(names: Iterable[str]) -> None:

@@ -175,8 +175,6 @@ class GymnasiumEpisode:
             observed = np.array(observation, np.float64).ravel()
             if len(self._observed) not in (0, len(observed)):
                 raise ValueError(f"{len(observed)} numbers observed, {len(self._observed)} before")
-            if len(odd := np.flatnonzero(~np.isfinite(observed))):
-                raise ValueError(f"entry {odd[0]} of its observation is {observed[odd[0]]}")
             self._observed = observed
         if self._camera is None:
             self._frame = self._observed.astype(np.float32)
@@ -290,7 +288,7 @@ def _try(episode: GymnasiumEpisode, settings: TaskSettings) -> None:
         episode.step(np.zeros(settings.action.size))
     except EnvironmentFails as error:
         raise UsageError(
-            f"task.parameters.id: {error.what}: install what it needs, or choose another"
+            f"task.parameters: {error.what}: install what is missing, or correct 'make' or 'reset'"
         ) from error
     episode.check_info()
 

@@ -29,7 +29,7 @@ from solar_cli.methods.reference import Fixed
 from solar_cli.models.basis import LatentBasis
 from solar_cli.models.neural import NeuralDynamics, Sequences
 from solar_cli.models.neural_fit import NeuralModel, NeuralTrainer
-from solar_cli.pulse import Diverged, Pulse
+from solar_cli.pulse import Pulse
 from solar_cli.settings import TaskSettings
 from solar_cli.settings.mpc_nn import MpcNn as MpcNnSettings
 from solar_cli.streams import Streams
@@ -85,8 +85,6 @@ class MpcNn(Learner):
             Sequences.of(self.states.of(episodes.frames), episodes, self.task.action_cost)
             for episodes in every
         ]
-        if not all(bool(torch.isfinite(batch.states).all()) for batch in seen):
-            raise Diverged(f"a state of iteration {experience.iteration} is not finite")
         name = f"iteration {experience.iteration}"
         return self.trainer.fit(name, self.model, seen, 1, settings.shooting.horizon)
 

@@ -187,7 +187,7 @@ def resolve(
         ("card", _with_method(card, card.tables, method_name)),
         (f"variant {variant}", _with_method(card, overrides, method_name, f"variants.{variant}.")),
     ]
-    layers += [("--set", tree) for tree in _assignments(sets)]
+    layers += [("--set", assignment(text)) for text in sets]
     merged: Table = {"method": _own_defaults(settings_class(entry))}
     origins: dict[str, str] = {}
     for origin, layer in layers:
@@ -198,7 +198,7 @@ def resolve(
             "method": layer.get("methods", {}).get(method_name, {}),
         }
         _merge(merged, deepcopy(tree))
-        origins.update({path: origin for path in _leaves(tree)})
+        origins.update({path: origin for path in leaves(tree)})
     where = f"task {card.name!r}, method {method_name!r}, variant {variant!r}"
     configuration = Configuration.model_construct(
         task=validated(TaskSettings, merged["task"], where, "task"),
@@ -281,19 +281,6 @@ def _check_methods(layer: Table, origin: str, card: Card) -> None:
             method(name)
 
 
-def _assignments(sets: Sequence[str]) -> list[Table]:
-    """Each `assignment`. Raises `UsageError` where two are of the same path."""
-    paths: set[str] = set()
-    trees = []
-    for text in sets:
-        trees.append(assignment(text))
-        path = ".".join(part.strip() for part in text.partition("=")[0].split("."))
-        if path in paths:
-            raise UsageError(f"--set {text!r}: {path} is set twice; keep one of them")
-        paths.add(path)
-    return trees
-
-
 def assignment(text: str) -> Table:
     """``a.b=TOML`` as nested tables. Raises `UsageError` when it is not of that form."""
     path, separator, value = text.partition("=")
@@ -322,11 +309,12 @@ def _merge(base: Table, over: Table) -> None:
             base[key] = value
 
 
-def _leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterable[str]:
+def leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterable[str]:
+    """The dotted path of each value in nested tables."""
     for key, value in tree.items():
         path = f"{prefix}{key}"
         if isinstance(value, dict):
-            yield from _leaves(value, f"{path}.")
+            yield from leaves(value, f"{path}.")
         else:
             yield path
 

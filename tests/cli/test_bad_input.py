@@ -22,6 +22,14 @@ FAULTS = {
     "unknown simulator": (("--set", 'task.simulator="nav"'), ["'nav'", "navigation"]),
     "no TOML": (("--set", "task.horizon=ten"), ["'ten'", "quotes"]),
     "no assignment": (("--set", "task.horizon"), ["PATH=VALUE"]),
+    "setting given twice": (
+        ("--set", "task.horizon=12", "--set", "task . horizon = 13"),
+        ["task.horizon is set twice"],
+    ),
+    "setting given in a table, too": (
+        ("--set", "task.exploration={ std = 2.0 }", "--set", "task.exploration.std=3.0"),
+        ["task.exploration.std is set twice"],
+    ),
     "setting of a method that does not run": (
         ("--set", "methods.vae.training.steps=3"),
         ["methods.vae.training.steps=3", "no method 'vae'"],

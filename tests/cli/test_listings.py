@@ -132,6 +132,21 @@ def test_show_works_for_a_cell_in_any_state(solar: Solar, stored: Stored, name: 
     inert(done)
 
 
+def test_show_says_why_changes_of_a_card_that_is_gone_are_not_shown(
+    solar: Solar, stored: Stored, tmp_path: Path
+) -> None:
+    from solar_cli.settings import cells, load_card
+
+    card = tmp_path / "elsewhere.toml"
+    card.write_text('extends = "nav"\n')
+    [cell] = cells(load_card(str(card)), "solar", [0])
+    with Store.open(str(stored.db)) as store:
+        store.add([cell])
+    done = solar("show", cell.hash, "--db", stored.db)
+    assert (done.code, "not shown: unknown task 'elsewhere'" in done.err) == (0, True)
+    assert "Different from" not in done.out
+
+
 def test_show_says_what_needs_a_look(solar: Solar, stored: Stored) -> None:
     assert "needs a look" not in solar("show", stored.finished.hash, "--db", stored.db).out
     with Store.open(str(stored.db)) as store:
@@ -382,7 +397,8 @@ def test_a_card_that_hides_a_built_in_one_is_told_of(solar: Solar, tmp_path: Pat
         assert (done.code, done.err.count("\n")) == (0, 1), done
         assert "tasks/nav.toml is used instead of the built-in card 'nav'" in done.err
     assert solar(*run, "nav-fixed").err == ""
-    assert "tasks/nav.toml is used instead" in solar(*run, "tasks/nav.toml").err
+    by_path = solar(*run, "tasks/nav.toml").err
+    assert "tasks/nav.toml is used instead of the built-in card 'nav'" in by_path
     assert solar(*run, str(original_path)).err == ""
 
 

@@ -200,11 +200,6 @@ def test_a_wrong_set_names_the_path_and_what_was_expected(text: str) -> None:
     check(lambda: resolve(load_card("nav"), "solar", "default", [text]), SET_FAULTS[text])
 
 
-def test_two_sets_of_one_path_are_refused() -> None:
-    twice = ["task.horizon=12", "methods.solar.training.steps=4", "task . horizon = 13"]
-    check(lambda: resolve(load_card("nav"), "solar", "default", twice), ["task.horizon", "twice"])
-
-
 @pytest.mark.parametrize("given", [{}, {"height": 8}, {"width": 8}])
 def test_an_image_needs_its_size(given: dict[str, int]) -> None:
     card = load_card("nav")
