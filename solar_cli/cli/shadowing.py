@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from os.path import isfile
 from pathlib import Path
 
 from solar_cli.cli.printing import complain
 from solar_cli.settings import load_card, method_names
-from solar_cli.settings.card import card_folders
+from solar_cli.settings.card import card_files, card_folders
 
 SLIP = 0.75
 """likeness from which on a name is a slip of the pen; a package's own may begin like another one"""
-
-
-def card_files(name: str) -> list[Path]:
-    """The files of that card; the first one is read, and a folder is no card."""
-    return [path for folder in card_folders() if (path := folder / f"{name}.toml").is_file()]
 
 
 def tell_shadowed(names: Iterable[str]) -> None:
@@ -28,7 +24,7 @@ def tell_shadowed(names: Iterable[str]) -> None:
         files = [Path(name)] if name.endswith(".toml") else card_files(name)
         for used in files[:1]:
             built_in = card_folders()[-1] / used.name
-            if used.is_file() and built_in.is_file() and not used.samefile(built_in):
+            if isfile(used) and isfile(built_in) and not used.samefile(built_in):
                 complain(f"solar: note: {used} is used instead of the built-in card {used.stem!r}")
 
 

@@ -56,8 +56,9 @@ def command(
     Example:
       solar tasks nav --method solar --variant smoke
     """
-    from solar_cli.cli.shadowing import card_files, tell_misspelt, tell_shadowed
+    from solar_cli.cli.shadowing import tell_misspelt, tell_shadowed
     from solar_cli.settings import card_names, load_card, resolve
+    from solar_cli.settings.card import card_files
 
     if preview is not None:
         _require_gif(name, preview, force)

@@ -90,6 +90,7 @@ class EnvironmentFails(SolarError):
     def __init__(self, what: str) -> None:
         super().__init__(f"{what}: an error of the environment's own code, which the log shows")
         self.what = what
+        """which environment, where, and why"""
 
 
 class GymnasiumEpisode:
@@ -249,7 +250,7 @@ def build(settings: TaskSettings) -> LoopTask:
             f"task.observation.window = {seen.window}: longer than an episode of task.horizon = "
             f"{settings.horizon} steps; change one"
         )
-    _try(GymnasiumEpisode(parameters, settings, camera), settings)
+    _require_a_start(GymnasiumEpisode(parameters, settings, camera), settings)
     return LoopTask(lambda: GymnasiumEpisode(parameters, settings, camera), settings)
 
 
@@ -275,13 +276,13 @@ def drawable(settings: TaskSettings, rows: int) -> TaskSettings:
     parameters = validated(Parameters, settings.parameters, where, "task.parameters")
     seen = Observation(kind="image", height=rows, width=rows, channels=3)
     shown, camera = settings.model_copy(update={"observation": seen}), Camera(seen)
-    _try(GymnasiumEpisode(parameters, shown, camera), shown)
+    _require_a_start(GymnasiumEpisode(parameters, shown, camera), shown)
     high, wide = camera.rendered
     seen = seen.model_copy(update={"width": round(rows * wide / high)})
     return settings.model_copy(update={"observation": seen})
 
 
-def _try(episode: GymnasiumEpisode, settings: TaskSettings) -> None:
+def _require_a_start(episode: GymnasiumEpisode, settings: TaskSettings) -> None:
     """Raise `UsageError` where an environment fails from the start, as for want of a package."""
     try:
         episode.reset(np.random.default_rng(0))

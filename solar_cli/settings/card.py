@@ -10,6 +10,7 @@ import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
+from os.path import isfile
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
@@ -95,6 +96,12 @@ def card_names() -> list[str]:
     return sorted({path.stem for folder in card_folders() for path in folder.glob("*.toml")})
 
 
+def card_files(name: str) -> list[Path]:
+    """The files of that card; the first one is read, and a folder is no card."""
+    paths = [folder / f"{name}.toml" for folder in card_folders()]
+    return [path for path in paths if isfile(path)]  # unlike is_file, also of a name too long
+
+
 def load_card(name: str) -> Card:
     """Read the card at path ``name`` (ending in .toml) or of that name.
 
@@ -102,9 +109,8 @@ def load_card(name: str) -> Card:
     """
     if name.endswith(".toml"):
         return _read(Path(name))
-    for folder in card_folders():
-        if (path := folder / f"{name}.toml").is_file():
-            return _read(path)
+    if files := card_files(name):
+        return _read(files[0])
     raise UsageError(f"unknown task {name!r}: {nearest(name, card_names())}")
 
 
@@ -151,7 +157,7 @@ def _extended(tables: Table, path: Path) -> Table:
     name = tables.pop("extends")
     folders = [path.parent, *card_folders()]
     bases = [folder / f"{name}.toml" for folder in folders] if isinstance(name, str) else []
-    base = next((base for base in bases if base.is_file()), None)
+    base = next((base for base in bases if isfile(base)), None)
     if base is None or name == path.stem:
         raise UsageError(
             f"card {path}: 'extends' must be the name of another card, not {name!r}: "

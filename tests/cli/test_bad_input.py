@@ -11,6 +11,11 @@ RUN = ("run", "--task", "nav", "--method", "solar", "--variant", "smoke")
 
 FAULTS = {
     "unknown task": (("--task", "nva"), ["'nva'", "did you mean 'nav'"]),
+    "task with a name that no file can have": (("--task", "n" * 300), ["'nnn", "known: "]),
+    "card with a name that no file can have": (
+        ("--task", "n" * 300 + ".toml"),
+        ["nnn.toml", "cannot be read"],
+    ),
     "unknown method": (("--method", "sloar"), ["'sloar'", "did you mean 'solar'"]),
     "unknown variant": (("--variant", "smok"), ["'smok'", "did you mean 'smoke'"]),
     "unknown setting": (("--set", "task.horzon=3"), ["task.horzon", "did you mean 'horizon'"]),
